@@ -54,7 +54,7 @@ from npa_envs.world.rollout import rollout, step
 
 
 class Gecko(NamedTuple):
-    """The shipped rule `gecko`, its task with one target point a particle, and seeds."""
+    """The shipped rule `gecko`, its task with as many target points as particles, start worlds."""
 
     rule: NPARule
     task: Morphogenesis2D
@@ -78,7 +78,7 @@ class Gecko(NamedTuple):
 
 
 def gecko(world_count: int, particle_count: int, device: torch.device) -> Gecko:
-    """Return the shipped rule with seeds of its task."""
+    """Return the shipped rule `gecko` with `world_count` start worlds of its task."""
     config = Morphogenesis2DConfig(particle_count=particle_count, target_point_count=particle_count)
     task = Morphogenesis2D(config, device=device)
     generator = torch.Generator(device).manual_seed(0)
@@ -88,7 +88,7 @@ def gecko(world_count: int, particle_count: int, device: torch.device) -> Gecko:
 
 @dataclass
 class Alternatives(TimingSession):
-    """A `TimingSession` with the methods to compare."""
+    """A `TimingSession` with the methods that are compared."""
 
     strategies: list[Strategy] = field(default_factory=lambda: list(STRATEGIES.values()))
     """Strategies to measure."""
@@ -96,7 +96,7 @@ class Alternatives(TimingSession):
     """Precisions to measure."""
 
     def usable_precisions(self) -> Iterator[Precision]:
-        """Yield the precisions that the device has."""
+        """Yield the precisions that can be measured on the device."""
         for precision in self.precisions:
             why = precision.obstacle(self.device)
             if why is None:
@@ -105,7 +105,7 @@ class Alternatives(TimingSession):
                 self.left_out[precision.name] = why
 
     def usable_strategies(self, x: Tensor) -> Iterator[Strategy]:
-        """Yield the strategies that have something to measure on worlds like `x`, [B, N, D]."""
+        """Yield the strategies that can be measured on worlds like `x`, [B, N, D]."""
         for strategy in self.strategies:
             why = strategy.obstacle(x)
             if why is None:
@@ -117,7 +117,7 @@ class Alternatives(TimingSession):
 
 
 def accuracy(session: Alternatives) -> Tables:
-    """Return run time against error: of perception, of rollouts, of other libraries."""
+    """Return tables of time and error: of perception, of rollouts, of other libraries."""
     geckos = [1024] if session.small else [1024, 4096]
     flat = Workload(2, 1, 1024, 1)
     compared = [flat, Workload(3, 1, 512 if session.small else 1024, 1)]
@@ -159,7 +159,7 @@ class PerceptionRow:
 
 
 class Perceived(NamedTuple):
-    """Densities [B, N], perception z [B, N, P], gradient of a functional of z by the states."""
+    """Densities [B, N], perceptions z [B, N, P], and the gradient of a functional by the states."""
 
     density: Tensor
     perception: Tensor
@@ -167,7 +167,7 @@ class Perceived(NamedTuple):
 
 
 def perception_rows(session: Alternatives, workload: Workload) -> list[PerceptionRow]:
-    """Return a row for each strategy and for each precision that perception knows of."""
+    """Return a row for each strategy and each precision of perception."""
     x, s = workload.worlds(session.device)
     exact = perceived(STRATEGIES["library"], x.double(), s.double(), workload.eps)
     rows: list[PerceptionRow] = []
@@ -186,7 +186,7 @@ def perception_rows(session: Alternatives, workload: Workload) -> list[Perceptio
 
 
 def perceived(strategy: Strategy, x: Tensor, s: Tensor, eps: float) -> Perceived:
-    """Return the perception of a strategy for worlds x [B, N, D] and s [B, N, C]."""
+    """Return what a strategy perceives in worlds x [B, N, D] and s [B, N, C]."""
     z = strategy.perceive(x, s, eps)
     cotangent = None
     if strategy.differentiable:
@@ -308,9 +308,9 @@ class Runner:
     def advanced(
         self, x: Tensor, s: Tensor, steps: int, generator: torch.Generator
     ) -> tuple[Tensor, Tensor]:
-        """Return worlds some steps later; differentiable in the rule where the strategy is.
+        """Return worlds `steps` steps later; differentiable in the rule if the strategy is.
 
-        The generator's update masks are the same draws for every strategy.
+        `generator` draws the same update masks for every strategy.
         """
         own = self.strategy.name == "library"
         at_once = steps if own and not self.precision.short_states else 1
@@ -333,7 +333,7 @@ class Runner:
 
     @torch.no_grad()
     def marks(self, marks: tuple[int, ...]) -> Iterator[tuple[Tensor, Tensor]]:
-        """Yield the worlds after each number of steps, increasing."""
+        """Yield the worlds after each number of steps; the numbers increase."""
         generator = mask_source(self.x)
         x, s = self.x, self.s
         for before, mark in zip((0, *marks), marks, strict=False):
@@ -341,7 +341,7 @@ class Runner:
             yield x, s
 
     def weight_gradient(self, generator: torch.Generator) -> Tensor:
-        """Return the gradient of a functional of the worlds `TIMED_STEPS` later by the weights."""
+        """Return the gradient by the weights of a functional of worlds after `TIMED_STEPS`."""
         x, s = self.advanced(self.x, self.s, TIMED_STEPS, generator)
         loss = (x * self._x_weights).sum() + (s * self._s_weights).sum()
         gradients = torch.autograd.grad(loss, list(self.rule.parameters()))
@@ -362,7 +362,7 @@ class Runner:
         return [session.cost(call, graph=graph, generator=generator) for call in calls]
 
     def psnr(self) -> float:
-        """Return the PSNR of the pictures against the target `TASK_STEPS` later [dB], mean."""
+        """Return the mean PSNR [dB] of pictures after `TASK_STEPS`, to the target."""
         (worlds,) = self.marks((TASK_STEPS,))
         picture = self.task.picture(*(tensor.float() for tensor in worlds))
         return float(psnr(picture, self.task.target_picture).mean())
@@ -375,9 +375,9 @@ def composed_step(
     s: Tensor,
     mask: Tensor,
 ) -> tuple[Tensor, Tensor]:
-    """Return worlds one step later, composed in torch: every particle perceives, some update.
+    """Return worlds one step later, computed in torch: every particle perceives, some update.
 
-    They perceive at the rule's own radius; the mask, uint8 [B, N], says which are updated.
+    The perception radius is the rule's `eps0`; `mask`, uint8 [B, N], is 1 where a particle updates.
     """
     active = mask[..., None].to(x.dtype)
     update = rule(strategy.perceive(x.detach(), s, rule.eps0))
@@ -409,20 +409,20 @@ def rollout_rows(session: Alternatives, particle_count: int) -> list[RolloutRow]
 
 
 def drawn_mask(x: Tensor, update_prob: float, generator: torch.Generator) -> Tensor:
-    """Return a step's update mask, drawn as `npa_envs.rollout` draws it, uint8, shape [B, N]."""
+    """Return a step's update mask as `npa_envs.rollout` would draw it, uint8, [B, N]."""
     mask = torch.empty(x.shape[:2], dtype=torch.uint8, device=x.device)
     return mask.bernoulli_(update_prob, generator=generator)
 
 
 def mask_source(like: Tensor) -> torch.Generator:
-    """Return the generator of the update masks, on the device of a tensor, at its start."""
+    """Return a new generator of update masks on a tensor's device, always with one seed."""
     return torch.Generator(like.device).manual_seed(3)
 
 
 def _task_runner(
     session: Alternatives, strategy: Strategy, precision: Precision, seed: Gecko
 ) -> Runner | None:
-    """Return the run that grows the picture; 512 steps that take too long are left out."""
+    """Return the run that grows the picture; None if its 512 steps take too long."""
     particle_count = seed.x.shape[1]
     slow = strategy.name in SLOW and particle_count > MAX_SLOW
     if slow or (strategy.name != "library" and (session.small or not session.cuda)):
@@ -474,7 +474,7 @@ Fields = dict[str, Tensor]
 
 @dataclass(frozen=True)
 class PeerRow:
-    """One or all of `OPERATIONS` of one library on one world, search for neighbours included.
+    """Time and error of operations of another library on one world, with its search for neighbours.
 
     The error is relative, the largest where several operations are one call.
     """
@@ -489,7 +489,7 @@ class PeerRow:
 
 @dataclass(frozen=True)
 class Call:
-    """A call that computes some operations; `capturable`: a CUDA graph can record it."""
+    """A call that computes some operations; `capturable`: whether a CUDA graph can record it."""
 
     operation: str
     run: Callable[[], Fields]
@@ -497,7 +497,7 @@ class Call:
 
 
 def peer_rows(session: Alternatives, workload: Workload) -> list[PeerRow]:
-    """Return rows of every peer that is there, on the first world of a workload."""
+    """Return rows of every other library that is installed, on a workload's first world."""
     x, s = (tensor[0] for tensor in workload.worlds(session.device))
     exact = _reference_fields(x.double(), s.double(), workload.eps)
     rows: list[PeerRow] = []
@@ -644,7 +644,7 @@ class Point(NamedTuple):
 
 
 def front(points: Iterable[Point]) -> list[Point]:
-    """Return the points that no other one beats in both time and error, by increasing error."""
+    """Return the points that no other one beats in both time and error, in order of error."""
     best: list[Point] = []
     for point in sorted(points, key=lambda point: (point.error, point.time)):
         if not best or point.time < best[-1].time:
@@ -791,7 +791,7 @@ def stored_ratios(path: Path, device: torch.device) -> dict[str, float]:
 
 
 def missed_ratios(measured: Mapping[str, float], stored: Mapping[str, float]) -> list[str]:
-    """Return a line for each stored ratio that is missed."""
+    """Return a line of text for each stored ratio that the measured one falls below."""
     return [
         f"{name}: {measured.get(name, math.nan):.3g}, stored {value:.3g}, "
         f"at least {value / TOLERANCE:.3g} wanted"

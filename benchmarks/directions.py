@@ -73,13 +73,9 @@ def train(arguments: argparse.Namespace) -> None:
             if arguments.size != "tiny":
                 # Few numbers of steps: few graphs.
                 fields["steps"] = (62, 64)
-            if arguments.iterations:
-                fields["iterations"] = arguments.iterations
-            if arguments.initial_rule:
-                fields["initial_rule"] = arguments.initial_rule
-            fields["optimiser"] = arguments.optimiser
-            if arguments.learning_rate:
-                fields["learning_rate"] = arguments.learning_rate
+            for name in ("iterations", "initial_rule", "optimiser", "learning_rate"):
+                if getattr(arguments, name):
+                    fields[name] = getattr(arguments, name)
             fields |= {"repeats": 1, "tensorboard": False, "picture_interval": 0}
             fields |= {"checkpoint_interval": 10**9, "device": arguments.device}
             out = arguments.out / "runs" / f"{target}-{kind}"
@@ -90,7 +86,7 @@ def train(arguments: argparse.Namespace) -> None:
 
 
 def tasks_of(config: Morphogenesis2DConfig, device: str) -> tuple[Morphogenesis2D, Morphogenesis2D]:
-    """Return the task of a run, and the same with worlds compared at the best angle."""
+    """Return the task of a run, and one that compares worlds at the best angle."""
     task = Morphogenesis2D(config, device=device)
     blind = replace(
         config,
@@ -103,7 +99,7 @@ def tasks_of(config: Morphogenesis2DConfig, device: str) -> tuple[Morphogenesis2
 
 @torch.no_grad()
 def measured(rule: npa_envs.NPARule, config: Morphogenesis2DConfig, device: str) -> dict[str, Any]:
-    """Return losses over the steps, and those of creatures turned by 90 degrees."""
+    """Return losses at `STEPS`, and later losses of grown creatures left alone or turned by 90°."""
     task, blind = tasks_of(config, device)
     random = WorldRandom(SEEDS, device=device)
     x, s, *_ = task.seed(len(SEEDS), generator=random, device=device)
@@ -131,7 +127,7 @@ def measured(rule: npa_envs.NPARule, config: Morphogenesis2DConfig, device: str)
 def run_on(
     rule: npa_envs.NPARule, task: Morphogenesis2D, x: Tensor, s: Tensor, steps: int, random: Any
 ) -> tuple[Tensor, Tensor]:
-    """Run a rule in the worlds of its task."""
+    """Return x and s of worlds `steps` steps later, with the rollout options of a task."""
     return npa_envs.rollout(
         rule, x, s, steps, eps=task.eps, update_prob=task.update_prob, generator=random
     )
@@ -150,26 +146,21 @@ def measure(arguments: argparse.Namespace) -> None:
         metadata = rule_metadata(path)
         rule = npa_envs.load_rule(path, device=arguments.device)
         config = trained_config(path, metadata).task
-        row = {
-            "iterations": int(metadata["iteration"]),
-            **measured(rule, config, arguments.device),
-        }
-        found[path.stem] = row
+        row = measured(rule, config, arguments.device)
+        row = found[path.stem] = {"iterations": int(metadata["iteration"]), **row}
         means = {step: round(statistics.mean(row["best_angle"][step]), 4) for step in STEPS}
         print(path.stem, means, "turned", round(ratio(row), 3), flush=True)
-        write_record(
-            arguments.out / "directions.json",
-            {"machine": machine(torch.device(arguments.device)), "rules": found},
-        )
+        content = {"machine": machine(torch.device(arguments.device)), "rules": found}
+        write_record(arguments.out / "directions.json", content)
 
 
 def ratio(row: Mapping[str, Sequence[float]]) -> float:
-    """Return the loss of turned creatures over that of those left alone."""
+    """Return the loss of turned creatures / that of creatures left alone."""
     return statistics.mean(row["turned"]) / statistics.mean(row["left_alone"])
 
 
 class InTorch(npa_envs.NPARule):
-    """A rule that runs as the module that it is, in plain torch."""
+    """A rule that runs in plain torch: overriding `forward` switches the kernels off."""
 
     def forward(self, perception: Tensor) -> Tensor:
         """Map perception vectors to updates."""
@@ -186,7 +177,7 @@ RULES: Mapping[str, Callable[[], npa_envs.NPARule]] = {
 
 
 def time_steps(arguments: argparse.Namespace) -> None:
-    """Take the time of a step of each kind of rule, with gradients and without."""
+    """Measure the time of a step of each kind of rule, with gradients and without."""
     found: dict[str, dict[str, float]] = {}
     device, steps = torch.device(arguments.device), arguments.steps
     for count in arguments.particles:
@@ -199,9 +190,8 @@ def time_steps(arguments: argparse.Namespace) -> None:
             for name, backward in (("inference", False), ("training", True)):
                 row[name] = seconds_of(rule, x, s, steps, backward) / steps * 1e6
                 print(count, kind, name, round(row[name], 1), "µs a step", flush=True)
-    write_record(
-        arguments.out / "directions_time.json", {"machine": machine(device), "steps": found}
-    )
+    content = {"machine": machine(device), "steps": found}
+    write_record(arguments.out / "directions_time.json", content)
 
 
 def seconds_of(rule: npa_envs.NPARule, x: Tensor, s: Tensor, steps: int, backward: bool) -> float:

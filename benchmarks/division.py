@@ -14,7 +14,7 @@ import argparse
 import json
 import math
 import statistics
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -81,7 +81,7 @@ def train(arguments: argparse.Namespace) -> None:
 
 
 def row(task: Task, x: Tensor, s: Tensor, divides: bool) -> dict[str, list[float]]:
-    """Return the loss of each world and how many particles live in it."""
+    """Return the loss of each world, and the number of living particles in each."""
     alive = living(s).sum(dim=1) if divides else torch.full((len(x),), x.shape[1])
     return {"loss": task.metric(x, s).tolist(), "living": alive.tolist()}
 
@@ -93,18 +93,19 @@ def measured(path: Path, device: torch.device) -> dict[str, Any]:
     task = task_of_rule(str(path), rule, device).task
     random = WorldRandom(SEEDS, device=device)
 
-    def run(x: Tensor, s: Tensor, steps: int) -> tuple[Tensor, Tensor]:
-        return npa_envs.rollout(
-            rule, x, s, steps, eps=task.eps, update_prob=task.update_prob, generator=random
-        )
+    def run(x: Tensor, s: Tensor, marks: Sequence[int]) -> tuple[Tensor, Tensor, dict[int, Any]]:
+        rows = {}
+        for before, step in zip((0, *marks), marks, strict=False):
+            steps = step - before
+            x, s = npa_envs.rollout(
+                rule, x, s, steps, eps=task.eps, update_prob=task.update_prob, generator=random
+            )
+            rows[step] = row(task, x, s, rule.divides)
+        return x, s, rows
 
     x, s, *_ = task.seed(len(SEEDS), generator=random, device=device)
-    found: dict[str, Any] = {"iteration": int(rule_metadata(path)["iteration"]), "grown": {}}
-    done = 0
-    for steps in STEPS:
-        x, s = run(x, s, steps - done)
-        done = steps
-        found["grown"][steps] = row(task, x, s, rule.divides)
+    found: dict[str, Any] = {"iteration": int(rule_metadata(path)["iteration"])}
+    x, s, found["grown"] = run(x, s, STEPS)
     if not rule.divides:
         return found
     alive = living(s)
@@ -112,13 +113,8 @@ def measured(path: Path, device: torch.device) -> dict[str, Any]:
     side = right >= right.quantile(1.0 - 0.5 * alive.float().mean().item(), dim=1, keepdim=True)
     second = alive & (alive.cumsum(dim=1) % 2 == 0)
     for name, gone in (("each second", second), ("one side", side & alive)):
-        y, u = x, torch.where(gone[..., None], 0.0, s)
-        found[name] = {0: row(task, y, u, True)}
-        done = 0
-        for steps in AFTER:
-            y, u = run(y, u, steps - done)
-            done = steps
-            found[name][steps] = row(task, y, u, True)
+        left = torch.where(gone[..., None], 0.0, s)
+        found[name] = {0: row(task, x, left, True)} | run(x, left, AFTER)[2]
     return found
 
 
@@ -131,10 +127,8 @@ def measure(arguments: argparse.Namespace) -> None:
         found[name] = measured(path, device)
         for when, rows in found[name].items():
             if isinstance(rows, dict):
-                means = {
-                    step: tuple(round(statistics.mean(each), 4) for each in values.values())
-                    for step, values in rows.items()
-                }
+                pairs = ((step, map(statistics.mean, row.values())) for step, row in rows.items())
+                means = {step: tuple(round(mean, 4) for mean in pair) for step, pair in pairs}
                 print(name, when, means, flush=True)
         write_record(arguments.out, {"machine": machine(device), "rules": found})
 

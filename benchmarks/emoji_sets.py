@@ -29,7 +29,7 @@ DRAWN = 12
 
 
 def single_emoji() -> dict[str, Image.Image]:
-    """Return the picture of every emoji of one character that the installed font draws, by name."""
+    """Return the picture of every one-character emoji in the installed font, by name."""
     emoji = {}
     for code in (code for first, last in BLOCKS for code in range(first, last + 1)):
         name = unicodedata.name(chr(code), "")
@@ -40,7 +40,7 @@ def single_emoji() -> dict[str, Image.Image]:
 
 
 def draw_pictures(arguments: argparse.Namespace) -> None:
-    """Write emoji, drawn at random but always the same of the same font, as PNG files."""
+    """Write random emoji as PNG files, always the same ones of the same font."""
     emoji = single_emoji()
     drawn = random.Random(0).sample(list(emoji), 2 * DRAWN)
     for number, name in enumerate(drawn):

@@ -43,7 +43,7 @@ from npa_envs.registration import SIZES, SPECIES_SIZES
 
 
 class Case(NamedTuple):
-    """Worlds B of particles N, perceiving within eps."""
+    """The size of a measurement: B worlds of N particles, and their perception radius eps."""
 
     world_count: int
     particle_count: int
@@ -458,7 +458,7 @@ def peer_rows(device: torch.device, quick: bool) -> Iterator[dict[str, Any]]:
 
 
 def show(row: dict[str, Any]) -> None:
-    """Print a row, numbers shortened."""
+    """Print a row with rounded numbers."""
     hidden = ("kernels", "step_us_range")
     short = {k: f"{v:.4g}" if isinstance(v, float) else v for k, v in row.items()}
     print("  ".join(f"{k} {v}" for k, v in short.items() if k not in hidden), flush=True)

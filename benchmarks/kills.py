@@ -53,7 +53,7 @@ def main() -> None:
 def killed(
     folder: RunFolder, told: argparse.Namespace, chance: random.Random, before: int
 ) -> dict[str, float]:
-    """Start or resume the run, kill one of its processes, and return the record of it."""
+    """Start or resume the run, kill one of its processes, and return what is left of it."""
     words = ["train", "morphogenesis2d", "--preset", told.preset, "--out", str(folder.path)]
     words += ["--processes", str(told.processes), "--device", told.device, "--resume", "auto"]
     words += ["--iterations", "1000000", "--checkpoint-interval", str(told.interval)]
@@ -92,13 +92,13 @@ def last_iteration(folder: RunFolder) -> int:
 
 
 def children(pid: int) -> list[int]:
-    """Return the processes that one has started (Linux)."""
+    """Return the ids of a process's child processes (Linux)."""
     told = Path(f"/proc/{pid}/task/{pid}/children").read_text("utf-8")
     return [int(child) for child in told.split()]
 
 
 def alive(pid: int) -> bool:
-    """Return whether a process runs (Linux)."""
+    """Return whether the process `pid` runs (Linux)."""
     try:
         told = Path(f"/proc/{pid}/stat").read_text("utf-8")
     except FileNotFoundError:

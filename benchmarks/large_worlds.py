@@ -33,7 +33,7 @@ TRAINING = (2**22, 2**24)
 def measured(
     particle_count: int, steps: int, device: torch.device, *, train: bool
 ) -> dict[str, object]:
-    """Return time and memory of a rollout of a world."""
+    """Return time and memory of a rollout of one world."""
     workload = Workload(2, 1, particle_count, steps)
     torch.cuda.reset_peak_memory_stats(device)
     x, s = workload.worlds(device)

@@ -81,7 +81,7 @@ TRAINED, HELD_OUT = 60, 20
 
 
 def draw_pictures(arguments: argparse.Namespace) -> None:
-    """Write emoji as PNG files, drawn at random but always the same of the same font."""
+    """Write random emoji as PNG files, always the same ones of the same font."""
     emoji = single_emoji()
     taken = random.Random(0).sample(list(emoji), 2 * DRAWN)
     left = [name for name in emoji if name not in taken]
@@ -143,7 +143,7 @@ WAYS: Mapping[str, type[npa_envs.NPARule]] = {
 
 
 class WayTask(ManyPictures):
-    """Many pictures by a rule of a given kind."""
+    """A task of many pictures whose rule is of a given kind."""
 
     kind: type[npa_envs.NPARule] = npa_envs.NPARule
 
@@ -305,10 +305,8 @@ def measure(arguments: argparse.Namespace) -> None:
                 ratios = [entry["psnr"] for entry in row["held_out"]]
                 print(path.stem, "held out", round(statistics.mean(ratios), 2), "dB", flush=True)
         found[path.stem] = row
-        write_record(
-            arguments.out / "many_pictures.json",
-            {"machine": machine(torch.device(device)), "rules": found},
-        )
+        content = {"machine": machine(torch.device(device)), "rules": found}
+        write_record(arguments.out / "many_pictures.json", content)
     print("ratios of medians", ratios_of(found))
 
 
@@ -357,9 +355,9 @@ def control_rows(rule: npa_envs.NPARule, config: Any, device: str) -> list[dict[
 def held_out_rows(
     rule: npa_envs.NPARule, config: Any, held_out: Sequence[str], device: str
 ) -> list[dict[str, Any]]:
-    """Return the worlds of a rule for unseen pictures, by its encoder.
+    """Return a row for each unseen picture, grown from the code that the rule's encoder gives it.
 
-    Beside it the PSNR of a blank picture, and of the trained picture that comes closest.
+    Beside it are the PSNR of an empty picture, and of the trained picture that comes closest.
     """
     known = tasks_of(rule, config, device)
     tasks = [
@@ -373,7 +371,7 @@ def held_out_rows(
 def floors(
     row: PictureRow, task: Morphogenesis2D, known: Sequence[Morphogenesis2D]
 ) -> dict[str, Any]:
-    """Return the PSNR of a blank and of the closest trained picture to a target [dB]."""
+    """Return the PSNR of an empty picture, and of the closest trained picture, to a target [dB]."""
     target = task.target_picture
     blank = psnr(torch.zeros_like(target)[None], target).item()
     nearest = max(known, key=lambda other: psnr(other.target_picture[None], target).item())

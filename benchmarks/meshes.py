@@ -319,7 +319,7 @@ def rule_for(source: str, eps: float, folder: Path) -> str:
 
 
 def own_changes(arguments: argparse.Namespace, arm: str) -> dict[str, Any]:
-    """Return the settings that a run changes in its preset."""
+    """Return the settings in which a run differs from its preset."""
     fast = arguments.size == "fast"
     own = FAST_BEFORE | FAST_ARMS[arm] if fast else RECIPE | ARMS[arm]
     if arm == "best":
@@ -412,7 +412,7 @@ def context_info(trainer: Trainer) -> dict[str, str]:
 
 
 def origin(arguments: argparse.Namespace) -> dict[str, str]:
-    """Return the facts of a line: machine and commit."""
+    """Return machine and commit, for a line of results."""
     commit = arguments.commit or current_commit()
     made_on = machine(torch.device(arguments.device))
     return {"commit": commit, "date": date.today().isoformat(), "machine": made_on}

@@ -34,7 +34,7 @@ GRID = 8
 
 
 def moved(x: Tensor, motion: str, place: Tensor, affine: Tensor, field: Tensor) -> Tensor:
-    """Return the positions of one world [1, N, 2] moved as far as a motion allows."""
+    """Return positions [1, N, 2] of one world, shifted by `place`, turned or bent by a motion."""
     away = x - x.mean(dim=1, keepdim=True)
     if motion == "angle":
         cosine, sine = affine[0, 0].cos(), affine[0, 0].sin()
@@ -49,7 +49,7 @@ def moved(x: Tensor, motion: str, place: Tensor, affine: Tensor, field: Tensor) 
 
 
 def least_loss(task: Morphogenesis2D, x: Tensor, s: Tensor, motion: str) -> float:
-    """Return the splat loss of one world moved so that it is least, by 60 steps of Adam."""
+    """Return the least splat loss of one world moved by a motion, found by 60 steps of Adam."""
     place = task.target.points.mean(dim=0).clone().requires_grad_()
     affine = torch.zeros(2, 2, requires_grad=True)
     field = torch.zeros(1, 2, GRID, GRID, requires_grad=True)
@@ -71,7 +71,7 @@ def least_loss(task: Morphogenesis2D, x: Tensor, s: Tensor, motion: str) -> floa
 
 
 def follow(arguments: argparse.Namespace) -> None:
-    """Print the part of an old world's loss that is due to motion of the whole world."""
+    """Print how much of an old world's loss is due to motion of the whole world."""
     rule = load_rule(arguments.rule)
     task = Morphogenesis2D(preset(arguments.preset, target=arguments.target).task)
     generator = torch.Generator().manual_seed(SEEDS[0])

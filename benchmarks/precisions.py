@@ -71,11 +71,11 @@ class Precision:
 
     @property
     def reaches_perception(self) -> bool:
-        """Whether perception itself differs from float32's, or is float32's."""
+        """Whether this precision concerns perception, not only the products of the rule."""
         return not (self.short_products or self.tensor_float)
 
     def obstacle(self, device: torch.device) -> str | None:
-        """Return why it has nothing to measure on a device; None where it has."""
+        """Return why it cannot be measured on a device; None if it can."""
         if self.tensor_float and device.type != "cuda":
             return "TF32 products exist on CUDA devices only"
         return None
@@ -93,7 +93,7 @@ class Precision:
 
     @contextlib.contextmanager
     def active(self) -> Iterator[None]:
-        """Set torch's switch for TF32 while a block runs."""
+        """Return a context in which torch's switch for TF32 is set as this precision needs."""
         before = torch.backends.cuda.matmul.allow_tf32
         torch.backends.cuda.matmul.allow_tf32 = self.tensor_float
         try:

@@ -76,14 +76,10 @@ def train_side_by_side(
     kept: Path | None = None,
     clock: float = math.inf,
 ) -> tuple[list[Trainer], float]:
-    """Train several rules, an iteration of each in turn; return the trainers and the seconds.
+    """Train a rule for each configuration, in parallel; return the trainers and the duration [s].
 
-    Args:
-        configs: Their settings.
-        longest: Stop after this time [s], finished or not.
-        kept: Folder that the rules are copied to every 512 iterations and at the end, by the names
-            of the runs' folders.
-        clock: Time in which their cosines fall [s], and training ends.
+    `longest` and `clock` are those of `iterate_together`. Every 512 iterations and at the end the
+    rules are copied to the folder `kept`, by the names of the runs' folders; None: they are not.
     """
     device = torch.device(configs[0].device)
     streams, trainers = [], []
@@ -104,14 +100,14 @@ def train_side_by_side(
 
 
 def keep(trainers: Sequence[Trainer], folder: Path) -> None:
-    """Copy the rules of runs to a folder."""
+    """Save the rules of runs, and copy them to a folder, by the names of the runs' folders."""
     for trainer in trainers:
         trainer.save()
         shutil.copy(trainer.folder.rule, folder / f"{trainer.config.out.name}.safetensors")
 
 
 def measured(trainer: Trainer, size: str, last_step: int = LAST) -> dict[str, Any]:
-    """Return growth and, where `last_step` is `LAST`, healing of a rule, by all worlds' means."""
+    """Return tables of a trained rule: growth; at a `last_step` of `LAST` healing; its pool."""
     task: Any = trainer.task
     rule = trainer.saved_rule
     device = trainer.config.device
@@ -144,7 +140,7 @@ def measured(trainer: Trainer, size: str, last_step: int = LAST) -> dict[str, An
 
 @torch.no_grad()
 def strip(trainer: Trainer, steps: Sequence[int]) -> np.ndarray[Any, Any]:
-    """Return a strip of pictures of the target and of one world as it grows."""
+    """Return a picture: the target, and beside it one world after each of `steps`, [R, W, 3]."""
     task: Any = trainer.task
     rule = trainer.saved_rule
     device = torch.device(trainer.config.device)
@@ -159,7 +155,7 @@ def strip(trainer: Trainer, steps: Sequence[int]) -> np.ndarray[Any, Any]:
 
 
 def read_lines(folder: Path) -> list[dict[str, Any]]:
-    """Return the finished runs in a folder."""
+    """Return the results of all finished runs in a folder, one dict each."""
     merged = folder / "recipes.json"
     lines: list[dict[str, Any]] = []
     if merged.exists():
@@ -172,12 +168,12 @@ def read_lines(folder: Path) -> list[dict[str, Any]]:
 
 
 def key_of(line: Mapping[str, Any]) -> Run:
-    """Return which run a line is of."""
+    """Return the run that a line of results is of."""
     return Run(*(line[name] for name in ("size", "arm", "picture", "seed")))
 
 
 def groups_of(runs: Iterable[Run], together: int) -> Iterator[list[Run]]:
-    """Yield runs of one size, a few at a time."""
+    """Yield lists of at most `together` runs of one size."""
     group: list[Run] = []
     for run in runs:
         if group and (len(group) == together or group[0].size != run.size):

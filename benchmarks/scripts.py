@@ -23,7 +23,7 @@ def script_parser(description: str | None) -> argparse.ArgumentParser:
 
 
 def script_facts(arguments: argparse.Namespace) -> dict[str, str]:
-    """Return the facts of a script's record: command without the path, commit, date, ..."""
+    """Return what a script's record begins with: command without the path, commit, date, ..."""
     words = ["OUT" if word == str(arguments.output) else word for word in sys.argv]
     return {
         "command": " ".join(["python", *words]),

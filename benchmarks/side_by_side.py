@@ -14,13 +14,13 @@ from npa_envs.training import Trainer
 
 
 def stream_of(device: str | torch.device) -> Any:
-    """Return a context with a new CUDA stream of a device; on a CPU an empty one."""
+    """Return a new CUDA stream of a device; on a CPU a context that does nothing."""
     device = torch.device(device)
     return torch.cuda.Stream(device) if device.type == "cuda" else contextlib.nullcontext()
 
 
 def on(stream: Any) -> Any:
-    """Return a context in which work goes to a stream."""
+    """Return a context in which CUDA work goes to what `stream_of` returned."""
     return torch.cuda.stream(stream) if isinstance(stream, torch.cuda.Stream) else stream
 
 
@@ -33,16 +33,11 @@ def iterate_together(
     ahead: int = 16,
     at: Callable[[int], None] | None = None,
 ) -> float:
-    """Train several rules, an iteration of each in turn; return the seconds.
+    """Train several rules, an iteration of each in turn; return the duration [s].
 
-    Args:
-        trainers: What is trained.
-        streams: The stream that each was made on.
-        longest: Stop after this time [s], finished or not.
-        clock: Time in which a cosine falls [s], where nobody knows how many iterations fit; then
-            training stops.
-        ahead: Iterations after which the host waits for the device.
-        at: Called with the number of each iteration before it begins.
+    Each trainer has its stream of `streams`. Training stops after `longest` seconds, or `clock`
+    seconds, in which the learning rate's cosine falls. Each `ahead` iterations the host waits for
+    the device. `at` is called with the number of each iteration before it begins.
     """
     cuda = trainers[0].config.device.startswith("cuda")
     begun = time.perf_counter()

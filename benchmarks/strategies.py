@@ -42,7 +42,7 @@ class Strategy:
     """Whether a CUDA graph can record it."""
 
     def obstacle(self, x: Tensor) -> str | None:
-        """Return why it has nothing to measure on worlds like `x`; None where it has."""
+        """Return why it cannot be measured on worlds like `x`; None if it can."""
         pairs = x.shape[0] * x.shape[1] ** 2
         if self.name == "plain" and not x.is_cuda:
             return "on a CPU the library runs these very kernels"
@@ -75,13 +75,13 @@ def _taken(values: Tensor, index: Tensor) -> Tensor:
 
 
 def capped_density(x: Tensor, s: Tensor, eps: float) -> Tensor:
-    """Return the density that the nearest neighbours alone give, shape [B, N]."""
+    """Return the density as a sum over the nearest neighbours only, shape [B, N]."""
     r = _taken(x, nearest(x, NEIGHBOUR_CAP)) - x[:, :, None]
     return reference.smoothing_kernel((r * r).sum(dim=-1), eps, x.shape[2]).sum(dim=2)
 
 
 def capped_perceive(x: Tensor, s: Tensor, eps: float) -> Tensor:
-    """Return perception vectors summed over the nearest neighbours alone, shape [B, N, P]."""
+    """Return perception vectors as sums over the nearest neighbours only, shape [B, N, P]."""
     index = nearest(x, NEIGHBOUR_CAP)
     r = _taken(x, index) - x[:, :, None]
     weight = reference.smoothing_kernel((r * r).sum(dim=-1), eps, x.shape[2])

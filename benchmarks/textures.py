@@ -61,7 +61,7 @@ def measured(
 
 
 def told(tables: dict[str, list[dict[str, Any]]]) -> str:
-    """Return the judge's ratios in a line."""
+    """Return the texture metric's ratios as a line of text."""
     return "  ".join(
         f"{r['step']}: {r['ratio']:.2f} ({r['patches']:.1f} {r['spectra']:.1f} {r['colours']:.1f})"
         for r in tables["judge"]

@@ -1,7 +1,7 @@
-"""Records and tables of measurements: JSON files with rows, and the facts of the run.
+"""Records of measurements (JSON files), the facts of their runs, and tables as text.
 
-Facts are what the rows depend on: device, machine, commit, versions, settings. A record is written
-after every entry, so that a stopped run can continue. Records with other facts are rejected.
+The facts of a run are what its results depend on: device, machine, commit, versions, settings. A
+record is written after every result, so that a stopped run can resume; other facts are an error.
 """
 
 from __future__ import annotations
@@ -26,19 +26,19 @@ from npa_envs.atomic_files import json_text, plain_numbers, read_json, write_tex
 from npa_envs.errors import NPAError, shown
 
 LIBRARIES = ("npa-envs", "torch", "warp-lang", "numpy", "scipy", "warpSPHCore")
-"""Distributions whose versions are recorded."""
+"""Python packages whose versions are recorded."""
 
 Content = TypeVar("Content")
 Row = TypeVar("Row")
 
 
 class Record(Generic[Row]):
-    """The results of a measurement (rows) and the facts of its run, kept in a JSON file, if any."""
+    """The results of a measurement (rows) and the facts of its run, in a JSON file if `path` is."""
 
     command: str
-    """The command that writes such records, for errors."""
+    """The command of `npa-envs` that writes such records, for messages of errors."""
     key = "facts"
-    """Key of the facts in the file."""
+    """Key in the file of the facts of the run."""
 
     def __init__(
         self, facts: Mapping[str, Any], path: Path | None = None, rows: Iterable[Row] = ()
@@ -46,15 +46,15 @@ class Record(Generic[Row]):
         self.facts, self.path, self.rows = facts, path, list(rows)
 
     def content(self) -> Mapping[str, Any]:
-        """Return the fields of the file except the facts of the run."""
+        """Return the fields of the file except the facts of the run, for JSON."""
         return {"rows": as_objects(self.rows)}
 
     def parse(self, content: dict[str, Any]) -> list[Row]:
-        """Return the rows from the JSON object of a file."""
+        """Return the rows in the JSON object of a file."""
         raise NotImplementedError
 
     def read(self) -> Self:
-        """Read the rows of the file, if it exists, and return this record."""
+        """Add the rows of the file, if it exists, to this record, and return this record."""
         if self.path is not None:
             parse, command = self.parse, self.command
             rows = read_record(self.path, self.facts, parse, command=command, key=self.key)
@@ -73,7 +73,7 @@ class Record(Generic[Row]):
 
 
 def write_record(path: Path, content: Any) -> None:
-    """Write JSON atomically; numbers that are not finite become null."""
+    """Write `content` as JSON, whole or not at all; infinite numbers and NaN become null."""
     write_text(path, json_text(content))
 
 
@@ -87,7 +87,8 @@ def read_record(
 ) -> Content | None:
     """Return `parse` of the JSON object in a file; None if the file does not exist.
 
-    Raises an NPAError, which names `command`, if the file's facts under `key` differ from `facts`.
+    If it is not a record, or the facts of its run (under `key`) differ from `facts`, an NPAError is
+    raised, which names the `command` of `npa-envs`.
     """
     if not os.path.exists(path):
         return None
@@ -111,7 +112,7 @@ def read_record(
 
 
 def number(value: float | None) -> float:
-    """Return a number read from a JSON record; NaN for null."""
+    """Return a number of a JSON record as a float; None (null) is NaN."""
     return math.nan if value is None else float(value)
 
 
@@ -125,7 +126,7 @@ def time_limit(max_seconds: float | None) -> Callable[[], bool]:
 
 
 def measured_facts(device: torch.device, commit: str | None, **settings: Any) -> dict[str, Any]:
-    """Return a record's facts: device, settings, commit (default: the checkout's) and versions."""
+    """Return a run's facts: device, settings, commit (None: the checkout's), versions, ..."""
     return {
         "device": device.type,
         "machine": machine(device),
@@ -136,9 +137,9 @@ def measured_facts(device: torch.device, commit: str | None, **settings: Any) ->
 
 
 def command_text(name: str, arguments: Sequence[str], *options: str) -> str:
-    """Return a command line as text, in which values of `options` are replaced: "--out OUT".
+    """Return the command line `npa-envs NAME ARGUMENTS` as text, for records.
 
-    Records do not name folders of the machine that they were written on.
+    Values of `options`, which are paths of this machine, are replaced: "--out OUT".
     """
     words = ["npa-envs", name]
     for argument in arguments:
@@ -152,7 +153,7 @@ def command_text(name: str, arguments: Sequence[str], *options: str) -> str:
 
 
 def machine(device: torch.device) -> str:
-    """Return the name of a device's hardware."""
+    """Return the name of a device's hardware, such as "NVIDIA H100" or "CPU (model)"."""
     if device.type == "cuda":
         return torch.cuda.get_device_name(device)
     try:
@@ -164,7 +165,7 @@ def machine(device: torch.device) -> str:
 
 
 def installed_version(name: str) -> str | None:
-    """Return the version of a distribution, None if it is not installed."""
+    """Return the version of a Python package; None: not installed."""
     try:
         return importlib.metadata.version(name)
     except importlib.metadata.PackageNotFoundError:
@@ -172,13 +173,13 @@ def installed_version(name: str) -> str | None:
 
 
 def versions() -> dict[str, str | None]:
-    """Return versions of Python and of `LIBRARIES`; None: not installed."""
+    """Return the versions of Python and of `LIBRARIES` by name; None: not installed."""
     libraries = {name: installed_version(name) for name in LIBRARIES}
     return {"python": platform.python_version(), **libraries}
 
 
 def current_commit() -> str:
-    """Return the short hash of this file's git checkout, "unknown" without one."""
+    """Return the short hash of the git checkout that this file is in; "unknown" if in none."""
     command = ["git", "describe", "--always", "--dirty", "--exclude=*"]
     try:
         done = subprocess.run(
@@ -192,14 +193,14 @@ def current_commit() -> str:
 # Tables: plain text, Markdown, comma-separated values, JSON
 
 UNMEASURED = "-"
-"""Cell of a plain text table without a value."""
+"""Text of a cell without a value, in tables of plain text."""
 
 NONE = "–"
-"""Cell of a Markdown table without a value."""
+"""Text of a cell without a value, in tables of Markdown."""
 
 
 def table_text(rows: Sequence[Any], *, missing: str = "never") -> str:
-    """Return instances of one dataclass as a plain text table with headings.
+    """Return rows, instances of one dataclass, as a table in plain text with the fields' names.
 
     None is shown as `missing`; if that is `UNMEASURED`, columns without values are left out.
     """
@@ -209,14 +210,14 @@ def table_text(rows: Sequence[Any], *, missing: str = "never") -> str:
 
 
 def aligned(lines: Sequence[Sequence[str]], *, left: bool = False) -> list[str]:
-    """Return a table's lines of cells as text, with columns aligned right or left."""
+    """Return lines of text from lines of cells, with columns aligned right, or `left`."""
     widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
     align = str.ljust if left else str.rjust
     return ["  ".join(map(align, line, widths)).rstrip() for line in lines]
 
 
 def table_markdown(rows: Sequence[Any], *, missing: str = "never") -> str:
-    """Return rows as a table in Markdown, with the headings and cells of `table_text`."""
+    """Return rows as a table in Markdown, with headings and cells as in `table_text`."""
     heads, *lines = _cells(rows, missing)
     return markdown_table(heads, lines)
 
@@ -236,23 +237,23 @@ def _cell(value: object, missing: str) -> str:
 
 
 def tables_json(tables: Mapping[str, Sequence[Any]], **facts: str) -> str:
-    """Return tables and facts as a JSON object; numbers that are not finite become null."""
+    """Return tables of rows by name, and `facts`, as JSON; infinite numbers and NaN become null."""
     return json_text({**facts, **{name: as_objects(rows) for name, rows in tables.items()}})
 
 
 def as_objects(rows: Iterable[Any]) -> list[dict[str, Any]]:
-    """Return instances of dataclasses as JSON objects."""
+    """Return instances of dataclasses as dicts, for JSON."""
     return [dataclasses.asdict(row) for row in rows]
 
 
 def markdown_table(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """Return a table in Markdown."""
+    """Return headings and rows of cells as a table in Markdown."""
     lines = [heads, ["---"] * len(heads), *rows]
     return "\n".join("| " + " | ".join(line) + " |" for line in lines)
 
 
 def csv_text(heads: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
-    """Return comma-separated values; floats have 12 digits."""
+    """Return headings and rows as comma-separated values; floats have 12 digits."""
     written = io.StringIO()
     writer = csv.writer(written, lineterminator="\n")
     writer.writerow(heads)
@@ -262,12 +263,12 @@ def csv_text(heads: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
 
 
 def short(value: float | str) -> str:
-    """Return a number with three digits; text stays as it is."""
+    """Return a number as text with three significant digits; text is returned as it is."""
     return value if isinstance(value, str) else f"{value:.3g}"
 
 
 def mean_with_error(mean: float, error: float, digits: int = 3) -> str:
-    """Return a mean ± its standard error as text; NaN: not known."""
+    """Return "mean ± standard error" with `digits` decimals; `NONE` if the mean is NaN."""
     if math.isnan(mean):
         return NONE
     return f"{mean:.{digits}f}" + ("" if math.isnan(error) else f" ± {error:.{digits}f}")

@@ -1,4 +1,4 @@
-"""Plots of measurements by matplotlib (extra `bench`): bands, matrices, scales, PNG files."""
+"""Parts of plots by matplotlib (extra `bench`): figures, bands, heat maps, axes, PNG files."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from npa_envs.errors import MissingDependencyError
 
 
 def check_matplotlib() -> None:
-    """Check that matplotlib is installed."""
+    """Raise MissingDependencyError unless matplotlib is installed."""
     try:
         import matplotlib  # noqa: F401
     except ImportError as error:
@@ -23,9 +23,9 @@ def check_matplotlib() -> None:
 
 
 def write_plots(draw: Callable[[], Mapping[str, bytes]], path: Path, what: str) -> list[str]:
-    """Write PNG files, and return a line of text for each; without matplotlib say so instead.
+    """Write the PNG files that `draw` returns by name; return a line of text for each.
 
-    `draw` returns the files by name, which replaces "*" in `path`; `what` names them in the text.
+    A file's name replaces "*" in `path`. Without matplotlib the line says that there are no `what`.
     """
     try:
         check_matplotlib()
@@ -40,7 +40,8 @@ def write_plots(draw: Callable[[], Mapping[str, bytes]], path: Path, what: str) 
 
 
 def new_figure(rows: int, columns: int, size: tuple[float, float]) -> tuple[Any, Any]:
-    """Return a figure of a size in inches and its grid of panels, without pyplot's global state."""
+    """Return a figure of `size` [inches], and its panels (matplotlib's Axes), [rows, columns]."""
+    # Without pyplot, which keeps figures in a global state.
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=size, layout="constrained")
@@ -48,14 +49,14 @@ def new_figure(rows: int, columns: int, size: tuple[float, float]) -> tuple[Any,
 
 
 def png(figure: Any, dpi: int = 90) -> bytes:
-    """Return a figure as a PNG file."""
+    """Return a figure as the bytes of a PNG file."""
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=dpi)
     return buffer.getvalue()
 
 
 def legend_of(figure: Any, panel: Any, place: str = "lower center", **options: Any) -> None:
-    """Show the legend of one panel at `place` outside of the figure's panels."""
+    """Add the legend of one panel's curves to the figure, at `place` outside of its panels."""
     handles, labels = panel.get_legend_handles_labels()
     figure.legend(handles, labels, loc=f"outside {place}", **options)
 
@@ -68,18 +69,18 @@ def draw_band(
     label: str,
     **options: Any,
 ) -> None:
-    """Draw a curve and a band at `across` (x); `lines`: the band's lower end, curve, upper end."""
+    """Plot a curve and a band over `across` (x): `lines` are lower end, curve and upper end (y)."""
     low, middle, high = lines
     panel.plot(across, middle, color=colour, label=label, **options)
     panel.fill_between(across, low, high, color=colour, alpha=0.2, lw=0)
 
 
 Matrix = tuple[Sequence[str], Sequence[str], Sequence[Sequence[float | None]]]
-"""Names of rows, names of columns, and positive numbers, row by row; None: a blank cell."""
+"""Names of rows, names of columns, and positive numbers, row by row; None: an empty cell."""
 
 
 def heat_map(matrices: Mapping[str, Matrix], *, colours: str, largest: float) -> bytes:
-    """Return a PNG of matrices by their titles; colours range from 1 / `largest` to `largest`."""
+    """Return a PNG of matrices by title; logarithmic colours from 1 / `largest` to `largest`."""
     from matplotlib.colors import LogNorm
 
     size = max(len(columns) for _, columns, _ in matrices.values())

@@ -1,4 +1,4 @@
-"""A queue of child processes over devices, each of which runs one process at a time.
+"""A queue of child processes, which run on several devices; signals end all of them.
 
 Machines that share a disk can divide the same runs among them (`part_of`), each with its own queue.
 """
@@ -21,15 +21,15 @@ from typing import Any, TypeVar
 from npa_envs.errors import NPAError
 
 STOPPING = ("SIGINT", "SIGTERM", "SIGHUP")
-"""Signals that stop a queue: from Ctrl-C, a scheduler, a closed terminal."""
+"""Names of the signals that stop a queue: of Ctrl-C, of a scheduler, of a closed terminal."""
 
 
 @dataclass(frozen=True)
 class Slots:
-    """How many child processes run at a time, and on which devices."""
+    """How many child processes run at once, and on which devices."""
 
     devices: Sequence[str]
-    """Devices; each process gets one."""
+    """Names of devices, such as "cuda:1"; each process runs on one."""
     jobs: int = 1
     """Number of processes at once, distributed over the devices in turn."""
     threads: int = 1
@@ -37,16 +37,16 @@ class Slots:
 
     @property
     def starts_early(self) -> bool:
-        """Whether the next process starts during a run: not on CPUs, which it would slow."""
+        """Whether processes start while others run: not if a device is a CPU, which they slow."""
         return not any(name.startswith("cpu") for name in self.devices)
 
 
 class Child(ABC):
-    """A child process; the queue gives it a device by `begin_work`."""
+    """A child process that has started, and waits for its device (`begin_work`)."""
 
     @abstractmethod
     def begin_work(self, device: str) -> None:
-        """Begin the work on a device, such as "cuda:1"."""
+        """Let the process begin its work on a device, such as "cuda:1"."""
 
     @property
     @abstractmethod
@@ -54,11 +54,11 @@ class Child(ABC):
         """Whether the process has ended, successfully or not."""
 
     def stop(self, *, at_once: bool) -> None:  # noqa: B027 - not all have something to save
-        """Ask the process to end, without saving if `at_once`; does not wait (`end` does)."""
+        """Ask the process to end, without saving if `at_once`; do not wait until it has ended."""
 
     @abstractmethod
     def end(self) -> None:
-        """End the process, or wait for it after `stop`, and release its resources."""
+        """End the process, or after `stop` wait until it has ended; release its resources."""
 
 
 SomeChild = TypeVar("SomeChild", bound=Child)
@@ -72,13 +72,12 @@ def run_children(
     starts_early: bool = False,
     max_seconds: float = math.inf,
 ) -> None:
-    """Run child processes until `start` returns no more; a signal or an error ends all of them.
+    """Run child processes until none runs and `start` returns None.
 
     `start` gets the children that have not ended, and returns the next one, or None if none is left
     or can start yet. `finished` gets each child that has ended. With `starts_early`, up to
     `slots.jobs` more children start and wait for a free slot. After `max_seconds` none begins its
-    work. After a signal all are asked to end before the first is waited for; a second signal ends
-    them at once.
+    work. An error or a signal of `STOPPING` ends all children; a second signal ends them at once.
     """
     waiting, running = deque[SomeChild](), dict[int, SomeChild]()
     deadline = time.monotonic() + max_seconds
@@ -119,7 +118,7 @@ def run_children(
 
 
 def _end(children: Sequence[Child], *, at_once: bool = False) -> None:
-    """End children; all are asked before the first is waited for, so that they save in parallel."""
+    """Stop all children, which save in parallel, and wait until they have ended."""
     try:
         for child in children:
             child.stop(at_once=at_once)
@@ -133,11 +132,11 @@ def _end(children: Sequence[Child], *, at_once: bool = False) -> None:
 
 @contextlib.contextmanager
 def _caught_signals() -> Iterator[list[int]]:
-    """Catch signals within a block in the list that is yielded; the second one also raises.
+    """Within a block, append signals of `STOPPING` to the list that is yielded.
 
-    So the first cannot interrupt the start of a process, which would then never be ended. Ignored
-    signals, as with nohup, stay ignored. In threads other than the main one, where signals cannot
-    be caught, nothing changes.
+    The second one also raises KeyboardInterrupt. The first does not, as it could interrupt the
+    start of a process, which would then never end. Ignored signals, as with nohup, stay ignored. In
+    threads other than the main one, where signals cannot be caught, the list stays empty.
     """
     signals: list[int] = []
     previous: dict[signal.Signals, Any] = {}
@@ -175,9 +174,9 @@ Item = TypeVar("Item")
 def part_of(
     items: Sequence[Item], part: str | None, group_of: Callable[[Item], Hashable]
 ) -> list[Item]:
-    """Return part K of N of the items, for `part` "K/N" such as "2/8"; None: all of them.
+    """Return part K of N parts of the items, for `part` "K/N" such as "2/8"; None: all items.
 
-    Items must be in the same order on all machines. Those of equal `group_of` are in one part.
+    Items of equal `group_of(item)` are in one part. All machines need the same items and order.
     """
     if part is None:
         return list(items)

@@ -25,7 +25,7 @@ from npa_envs.tasks.morphogenesis3d import Morphogenesis3D
 from npa_envs.tasks.point_classification import PointClassification, majority
 from npa_envs.world.brushes import cut, wipe_state
 from npa_envs.world.particles import Particles, combined
-from npa_envs.world.randomness import Randomness, WorldRandom
+from npa_envs.world.randomness import Randomness, WorldRandom, normal_draws
 from npa_envs.world.rollout import rollout_particles
 
 PROGRESS_STEPS = 32
@@ -166,9 +166,7 @@ def healing(
     x, s, *_ = runner.run(worlds, grow_steps)
     task = runner.task
     before = task.metric(x, s)
-    normal = torch.randn(
-        len(x), x.shape[2], generator=runner.generator, dtype=x.dtype, device=x.device
-    )
+    normal = normal_draws(runner.generator, (len(x), x.shape[2]), x)
     centre = random_particle(x, generator=runner.generator)
     wiped = task.with_target_code(wipe_state(x, s, centre=centre, radius=wipe_radius, box=task.box))
     slit = cut(x, s, centre=x.mean(1), normal=normal, gap=cut_gap, box=task.box)
@@ -234,8 +232,7 @@ class ChangeRow:
     """Votes of all clouds `steps` steps after their particles were cut off or moved (`change`).
 
     Fractions in [0, 1]: `majority`, of clouds whose majority votes for the class after the change;
-    `particle`, of particles that do; `majority_before`, of clouds whose majority votes for the
-    class before the change.
+    `particle`, of particles that do; `majority_before`, of clouds by the class before it.
     """
 
     change: str
@@ -465,10 +462,8 @@ def _copied_runner(
     progress: Callable[[int], None] | None,
 ) -> RuleRunner:
     """Return a runner of a copy of the rule on `device`; `seed` is that of the update masks."""
-    rule = copy.deepcopy(rule).to(device)
-    return RuleRunner(
-        rule, task.for_rule(rule), torch.Generator(device).manual_seed(seed), progress
-    )
+    rule, generator = copy.deepcopy(rule).to(device), torch.Generator(device).manual_seed(seed)
+    return RuleRunner(rule, task.for_rule(rule), generator, progress)
 
 
 def _from_seeds(

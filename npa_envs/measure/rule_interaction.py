@@ -98,10 +98,9 @@ class InteractionRow:
 
 
 def verdict(change: float, mixing: float, margin: float) -> str:
-    """Return "cooperates" if `change` (together / alone) is below 1 - margin, as text.
+    """Return "cooperates" for a change below 1 - margin, "undisturbed" for one up to 1 + margin.
 
-    Up to 1 + margin it is "undisturbed", above or NaN "disrupted". ", mixes" follows if the mixing
-    index is at least `MIXED`.
+    Otherwise it is "disrupted". ", mixes" follows if the mixing index is at least `MIXED`.
     """
     word = "disrupted"
     if change < 1.0 - margin:
@@ -114,8 +113,7 @@ def verdict(change: float, mixing: float, margin: float) -> str:
 def ratio_interval(numerators: Tensor, denominators: Tensor) -> tuple[float, float]:
     """Return both ends of the 95 % bootstrap interval of mean(numerators) / mean(denominators).
 
-    Worlds are resampled. Numerators [B] may be infinite. Denominators [B] are finite and not
-    negative; a ratio to 0 is infinite.
+    Worlds are resampled. Numerators [B] may be infinite, denominators [B] are finite and >= 0.
     """
     count = len(numerators)
     chosen = np.random.default_rng(0).integers(count, size=(2000, count))
@@ -133,8 +131,7 @@ def mixing_index(x: Tensor, counts: Sequence[int], *, eps: float) -> Tensor:
 
     It is the mean over particles of the entropy of each species' fraction of the particle's
     density, divided by log K. 0 means that no particle perceives another species, 1 that all
-    perceive all species equally. `counts` are the numbers of particles of each species, in x's
-    order.
+    perceive all species equally. `counts` are the particles of each species, in order.
     """
     rho = species_fields(x, counts, eps=eps).rho
     fractions = rho / rho.sum(dim=2, keepdim=True)
@@ -161,8 +158,7 @@ class RuleUnderTest(NamedTuple):
 class Encounters:
     """Grows pairs of rules together, and each one without the other, from the same random seeds.
 
-    Rules that cannot share a world raise NPAError. `progress` is called with the steps done since
-    its last call.
+    Rules that cannot share a world raise NPAError. `progress` is called with new steps done.
     """
 
     def __init__(
@@ -196,8 +192,7 @@ class Encounters:
     ) -> tuple[list[InteractionRow], dict[str, NDArray[np.uint8]]]:
         """Grow `first` together with `second`; return the row of `first` at each setting.
 
-        Also returns pictures, uint8, [R, R, 3], of the first world at each setting and each of
-        `FRAME_TIMES`, by their captions.
+        Also returns pictures [R, R, 3] of first worlds by captions, len(FRAME_TIMES) for each.
         """
         rows, frames, settings = [], {}, self.settings
         for factor, ratio, distance in itertools.product(

@@ -1,11 +1,12 @@
-"""The metric of textures: three distances from the target that no training loss contains.
+"""The metric of textures: a picture's distance from the target, by no loss that training uses.
 
-Each is divided by the distance of a drawing of the target by particles, or by 2 % of the distance
-of grey noise if that is larger.
+It has three parts: patches, power spectra, colours of pairs of pixels. Each is divided by that of
+particles that draw the target itself, or by 2 % of that of grey noise if this is larger.
 """
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import dataclass
 
@@ -17,30 +18,32 @@ from npa_envs.tasks.losses.texture import quantiles
 from npa_envs.tasks.texture import Texture, colour_image
 
 REFERENCE = 128
-"""Resolution for which lengths are given in pixels; they are scaled for others."""
+"""Resolution [pixels] at which the lengths below hold; at others they are scaled with it."""
 PATCH = 24
 """Side of a patch [pixels], which no training loss uses."""
 DIRECTIONS = 64
-"""Random directions that patches are projected on."""
+"""Number of random directions that patches are projected on."""
 BANDS = 7
-"""Logarithmic bands of the wave number, `BAND_RATIO` wide, up to half a wave per pixel."""
+"""Number of bands of the wave number, up to half a wave per pixel."""
 BAND_RATIO = math.sqrt(2.0)
+"""Highest wave number of a band / lowest."""
 ORIENTATIONS = 8
-"""Orientations of waves in half a turn."""
-DISTANCES = (1, 2, 4, 6, 9, 13, 19, 28)
+"""Number of orientations of waves in half a turn."""
+PAIR_DISTANCES = (1, 2, 4, 6, 9, 13, 19, 28)
 """Distances of the pairs of pixels whose colours are counted [pixels]."""
-AXES = ((0, 1), (1, 1), (1, 0), (1, -1))
-"""Directions of these pairs, rows and columns."""
+PAIR_DIRECTIONS = ((0, 1), (1, 1), (1, 0), (1, -1))
+"""Directions of these pairs: rows down, columns to the right."""
 DRAWINGS = 4
-"""Drawings of the target by particles, whose mean distance is the unit."""
+"""Number of drawings of the target by particles, whose mean distance is the unit."""
 
 
 @dataclass(frozen=True)
 class TextureRow:
-    """Pictures' distances from the target, over those of particles that draw it; means over worlds.
+    """Distances of worlds' pictures from the target at `step`, means over the worlds.
 
-    `patches` are sliced Wasserstein distances of patches, `spectra` distances of oriented power
-    spectra, `colours` those of co-occurring colours; `ratio` is the mean of the three.
+    1 is the distance of particles that draw the target itself. `patches` are sliced Wasserstein
+    distances of patches, `spectra` distances of oriented power spectra, `colours` those of the
+    colours of pairs of pixels. `ratio` is the mean of the three, `ratio_worst` the largest world's.
     """
 
     step: int
@@ -52,9 +55,9 @@ class TextureRow:
 
 
 class TextureMetric:
-    """Distance of pictures from the target of a texture task; other tasks raise NPAError.
+    """Computes distances of pictures from the target of a texture task; others raise NPAError.
 
-    It is computed in float64 with directions from a fixed seed, so that CPU and GPU agree.
+    It uses float64 and the same random directions each time, so that CPU and GPU agree.
     """
 
     def __init__(self, task: object) -> None:
@@ -68,22 +71,17 @@ class TextureMetric:
         self._scale = resolution / REFERENCE
         device = task.target_picture.device
         generator = torch.Generator().manual_seed(0)
-        side = max(2, min(resolution, round(PATCH * self._scale)))
-        directions = torch.randn(DIRECTIONS, 4, side, side, generator=generator).double()
-        directions /= directions.flatten(1).norm(dim=1)[:, None, None, None]
-        filters = torch.zeros(DIRECTIONS, 4, resolution, resolution, dtype=torch.float64)
-        filters[..., :side, :side] = directions
-        self._side = side
-        self._filters = torch.fft.rfft2(filters.to(device)).conj()
+        self._side = max(2, min(resolution, round(PATCH * self._scale)))
+        self._filters = _patch_filters(self._side, resolution, generator, device)
         bins = _wave_bins(resolution)[:, None] == torch.arange(1, 1 + BANDS * ORIENTATIONS)
         self._bins = bins.double().to(device)
+        wrap = task.target.tiles
         self._window = torch.ones(resolution, resolution, dtype=torch.float64, device=device)
-        if not task.target.tiles:
+        if not wrap:
             ramp = torch.hann_window(resolution, periodic=False, dtype=torch.float64)
             self._window = torch.outer(ramp, ramp).to(device)
         target = _images(task.drawable[None])
-        self._codes = _codes(target[0].flatten(1).T, 12)
-        wrap = task.target.tiles
+        self._palette = _typical_colours(target[0].flatten(1).T, 12)
         self._patches = self._projections(target, wrap)
         self._spectra = self._amplitudes(target)
         self._colours = self._counts(target, wrap)
@@ -96,7 +94,7 @@ class TextureMetric:
 
     @torch.no_grad()
     def __call__(self, pictures: Tensor) -> Tensor:
-        """Return ratios of patches, spectra and colours, float64, [B, 3], for [B, R, R, 4]."""
+        """Return the three distances of `TextureRow` for each picture, float64, [B, 3]."""
         if pictures.shape[1:] != self._task.target_picture.shape:
             raise NPAError(
                 f"pictures must have shape [B, R, R, 4] with R as the target's "
@@ -106,7 +104,7 @@ class TextureMetric:
         return self._distances(images) / self._units
 
     def row(self, x: Tensor, s: Tensor, step: int) -> TextureRow:
-        """Return the row of worlds that are `step` steps after their seed."""
+        """Return the row of worlds x and s at `step`, as the task draws them."""
         ratios = self(self._task.picture(x, s))
         each = ratios.mean(1)
         patches, spectra, colours = ratios.mean(0).tolist()
@@ -122,7 +120,7 @@ class TextureMetric:
         return torch.stack(distances)
 
     def _projections(self, image: Tensor, wrap: bool) -> Tensor:
-        """Return the quantiles of the patches' projections, [DIRECTIONS, R²]; `wrap`: periodic."""
+        """Return quantiles of the projections of an image's patches, [DIRECTIONS, R²]."""
         waves = torch.fft.rfft2(image)
         projected = torch.fft.irfft2((waves * self._filters).sum(1), s=image.shape[-2:])
         count = image.shape[-1] ** 2
@@ -132,44 +130,54 @@ class TextureMetric:
         return quantiles(projected.flatten(1), count)
 
     def _amplitudes(self, image: Tensor) -> Tensor:
-        """Return the square root of each channel's power in each bin of waves, [4, bins]."""
+        """Return roots of an image's power by channel and by bin of waves, [4, bins]."""
         flat = (image - image.mean(dim=(2, 3), keepdim=True)) * self._window
         power = torch.fft.fft2(flat, norm="forward").abs().square() / self._window.square().mean()
         sums: Tensor = power[0].flatten(1) @ self._bins
         return sums.sqrt()
 
     def _counts(self, image: Tensor, wrap: bool) -> Tensor:
-        """Return the fractions of pairs of pixels with each two of K colours, [pairs, K, K]."""
-        away = (image[0].movedim(0, -1)[..., None, :] - self._codes).square().sum(-1)
+        """Return fractions of pairs of pixels with each two of K colours, [pairs, K, K]."""
+        away = (image[0].movedim(0, -1)[..., None, :] - self._palette).square().sum(-1)
         near = torch.exp(-0.5 * away / 0.15**2)
-        # One more code for colours that are near no other.
+        # One more entry for colours that are near no other.
         near = torch.cat((near, torch.full_like(near[..., :1], 0.05)), dim=-1)
         near = near / near.sum(-1, keepdim=True)
         result = []
         side = near.shape[0]
-        for distance in DISTANCES:
-            for down, across in AXES:
-                steps = max(1, round(distance * self._scale))
-                moved = near.roll((-down * steps, -across * steps), dims=(0, 1))
-                first = near
-                if not wrap:
-                    rows = slice(0, side - down * steps)
-                    columns = slice(max(0, -across * steps), side - max(0, across * steps))
-                    first, moved = near[rows, columns], moved[rows, columns]
-                first, moved = first.flatten(0, 1), moved.flatten(0, 1)
-                result.append(first.T @ moved / len(first))
+        for distance, (down, across) in itertools.product(PAIR_DISTANCES, PAIR_DIRECTIONS):
+            steps = max(1, round(distance * self._scale))
+            moved = near.roll((-down * steps, -across * steps), dims=(0, 1))
+            start = near
+            if not wrap:
+                rows = slice(0, side - down * steps)
+                columns = slice(max(0, -across * steps), side - max(0, across * steps))
+                start, moved = near[rows, columns], moved[rows, columns]
+            start, moved = start.flatten(0, 1), moved.flatten(0, 1)
+            result.append(start.T @ moved / len(start))
         return torch.stack(result)
 
 
+def _patch_filters(
+    side: int, resolution: int, generator: torch.Generator, device: torch.device
+) -> Tensor:
+    """Return spectra that project an image's patches on random directions, [DIRECTIONS, 4, ...]."""
+    directions = torch.randn(DIRECTIONS, 4, side, side, generator=generator).double()
+    directions /= directions.flatten(1).norm(dim=1)[:, None, None, None]
+    filters = torch.zeros(DIRECTIONS, 4, resolution, resolution, dtype=torch.float64)
+    filters[..., :side, :side] = directions
+    return torch.fft.rfft2(filters.to(device)).conj()
+
+
 def _images(pictures: Tensor) -> Tensor:
-    """Return colours and density of pictures [B, R, R, 4], float64, shape [B, 4, R, R]."""
+    """Return red, green, blue and density of pictures [B, R, R, 4], float64, [B, 4, R, R]."""
     channels = pictures.double().movedim(-1, 1)
     # The plain density, no power of it, as the faintest parts of edges should count little.
     return torch.cat((colour_image(channels), channels[:, 3:]), dim=1)
 
 
 def _wave_bins(resolution: int) -> Tensor:
-    """Return the bin of each wave by wave number and orientation, int64, [R²]; 0: none."""
+    """Return each wave's bin by wave number and orientation, from 1 on, int64, [R²]; 0: none."""
     waves = torch.fft.fftfreq(resolution, dtype=torch.float64)
     down, across = torch.meshgrid(waves, waves, indexing="ij")
     length = torch.hypot(down, across)
@@ -183,8 +191,8 @@ def _wave_bins(resolution: int) -> Tensor:
     return torch.where(length > 0.0, bins, torch.zeros_like(bins)).long().flatten()
 
 
-def _codes(colours: Tensor, count: int) -> Tensor:
-    """Return K = `count` k-means centres [K, F] of colours [M, F], from far apart initial ones."""
+def _typical_colours(colours: Tensor, count: int) -> Tensor:
+    """Return `count` = K typical colours [K, F] of colours [M, F], the centres of k-means."""
     centres = colours.mean(0, keepdim=True)
     for _ in range(count - 1):
         away = torch.cdist(colours, centres).amin(1)

@@ -128,10 +128,7 @@ def density_colours(density: Tensor, background: tuple[float, float, float]) -> 
 
 @functools.lru_cache(maxsize=16)
 def ramp(background: tuple[float, float, float]) -> NDArray[np.uint8]:
-    """Return the colours of increasing densities, uint8, [RAMP_LENGTH, 3].
-
-    The first one is the background (red, green and blue in [0, 1]); the last one contrasts with it.
-    """
+    """Return colours of rising densities, from the background on, uint8, [RAMP_LENGTH, 3]."""
     stops = [[int(stop[k : k + 2], 16) / 255 for k in (1, 3, 5)] for stop in RAMP_STOPS]
     first = oklab(torch.tensor([background], dtype=torch.float64))
     # Over a light background the ramp gets darker with density.

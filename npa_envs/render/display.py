@@ -30,15 +30,12 @@ MAX_SHOWN = 16
 """Maximum number of worlds in a picture; further ones are not drawn."""
 
 _GAP = 4
-"""White pixels between two worlds."""
 
 
 class Shown:
     """A picture or a repeating film, which a notebook displays when it is the value of a cell.
 
-    Args:
-        frames: One picture, or the film's, of one size, uint8, shape [H, W, 3] each.
-        fps: Frames per second.
+    Frames are pictures of one size, uint8, shape [H, W, 3] each; `fps` is their number per second.
     """
 
     def __init__(self, frames: Iterable[Frame], fps: float) -> None:

@@ -32,7 +32,6 @@ GIF_HIGHEST_RATE = 50
 """Maximum `fps` at which players show a GIF."""
 
 _MARGIN = 8
-"""Gap between the frames of a filmstrip [pixels]."""
 
 
 def write_png(path: str | Path, frame: Frame) -> None:

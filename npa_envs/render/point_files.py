@@ -78,7 +78,6 @@ def _ply_header(count: int, **properties: Sequence[str]) -> bytes:
 
 
 def _checked(x: Tensor) -> NDArray[np.float32]:
-    """Return positions x [1, N, 3] as an array [N, 3]; other shapes raise NPAError."""
     if x.ndim != 3 or x.shape[0] != 1 or x.shape[2] != 3:
         raise NPAError(
             f"x must be the positions of one 3D world, [1, N, 3], got {tuple(x.shape)}: "

@@ -141,10 +141,7 @@ def write_3d_world(
     resolution: int = SCREEN,
     background: str = "white",
 ) -> list[Path]:
-    """Write a 3D world as a turntable (GIF), and as three files of points; return their paths.
-
-    The task `drawn_by` draws the turntable, whose frames have `resolution` pixels on each side.
-    """
+    """Write a 3D world as a turntable, drawn by a task, and as point files; return the paths."""
     names = ("turntable.gif", "points.ply", "gaussians.ply", "cloud.splat")
     paths = [folder / name for name in names]
     x, s, *_ = worlds

@@ -1,4 +1,4 @@
-"""The stress command finds what breaks, says where, and goes on where it was stopped."""
+"""The stress command finds what breaks, says where, and continues where it was stopped."""
 
 import copy
 import dataclasses

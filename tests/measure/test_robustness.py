@@ -1,4 +1,4 @@
-"""Rules are tried under other conditions and damaged beside twins; recovery is what it is said."""
+"""Rules are tried under other conditions and damaged; recovery is measured by undamaged copies."""
 
 import json
 import math
@@ -133,21 +133,21 @@ def test_seeds_of_other_shapes_are_where_they_should_be(space_dim, device):
 
 
 @pytest.mark.parametrize(
-    ("losses", "twins", "step"),
+    ("losses", "undamaged", "step"),
     [
         ([5.0, 3.0, 1.1, 1.0], [1.0, 1.0, 1.0, 1.0], 32),
         ([5.0, 3.0, 1.11, 1.0], [1.0, 1.0, 1.0, 1.0], 64),
         ([5.0, 3.0, 1.2, 1.2], [1.0, 1.0, 1.0, 1.0], None),
         ([1.0, 3.0, 3.0, 3.0], [1.0, 1.0, 1.0, 1.0], 0),
-        # It is the twin of the same step that counts.
+        # It is the undamaged copy of the same step that counts.
         ([4.0, 4.0, 4.0, 4.0], [1.0, 2.0, 3.0, 4.0], 64),
         ([math.nan, math.nan, math.nan, math.nan], [1.0, 1.0, 1.0, 1.0], None),
         ([2.0, 0.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0], 16),
         ([2.0, 0.1, 0.1, 0.1], [1.0, 0.0, 0.0, 0.0], None),
     ],
 )
-def test_recovery_is_the_first_step_within_a_tenth_of_the_twin(losses, twins, step):
-    curve = trials.LossCurve("wipe", (0, 16, 32, 64), (losses,), (twins,))
+def test_recovery_is_the_first_step_within_a_tenth_of_the_undamaged_copy(losses, undamaged, step):
+    curve = trials.LossCurve("wipe", (0, 16, 32, 64), (losses,), (undamaged,))
     assert curve.recovery_steps() == [step]
 
 
@@ -165,7 +165,7 @@ def record(*found: trials.LossCurve, **changed) -> report.RuleRecord:
 
 
 def responding(condition: str, *losses_by_value) -> report.RuleRecord:
-    """A record of one condition beside the loss as trained, which is 1 unless it says so."""
+    """A record of one condition beside the trained loss, which is 1 unless it says so."""
     responses = [report.Response(condition, value, 8, losses) for value, losses in losses_by_value]
     trained = () if condition == "eps" else (report.Response("eps", 1.0, 8, (0.5, 1.5)),)
     return record(responses=(*trained, *responses))
@@ -174,7 +174,7 @@ def responding(condition: str, *losses_by_value) -> report.RuleRecord:
 @pytest.mark.parametrize(
     ("condition", "losses_by_value", "text"),
     [
-        # It is the mean that counts, over that as trained, where all seeds are finite.
+        # It is the mean that counts, over the trained one, where all seeds are finite.
         ("dt", [(0.5, (0.1, 3.8)), (1.0, (0.5, 1.5)), (2.0, (0.1, 4.0))], "0.5, 1"),
         ("dt", [(0.5, (0.1, math.nan)), (1.0, (0.5, 1.5)), (2.0, (0.1, 0.1))], "1, 2"),
         ("update_prob", [(0.2, (3.0, 3.0)), (0.5, (0.5, 1.5)), (1.0, (1.0, 1.0))], "0.5, 1"),
@@ -214,19 +214,19 @@ def test_damaged_worlds_go_beside_twins_with_the_same_masks(name, device):
         trials.CONTROL,
         *(n for n, d in trials.DAMAGES.items() if d.static or not static),
     }
-    twins = found["wipe"].undamaged
-    assert twins == found[trials.CONTROL].undamaged == found["noise"].undamaged
-    assert tuple(curve[0] for curve in twins) == pytest.approx(trained.losses, rel=1e-6)
-    # At first the control is its twin; then masks are others.
+    undamaged = found["wipe"].undamaged
+    assert undamaged == found[trials.CONTROL].undamaged == found["noise"].undamaged
+    assert tuple(curve[0] for curve in undamaged) == pytest.approx(trained.losses, rel=1e-6)
+    # At first the control is its undamaged copy; then masks are others.
     assert found[trials.CONTROL].ratios(0) == [1.0, 1.0]
     if not static:
-        assert found[trials.CONTROL].losses != twins
+        assert found[trials.CONTROL].losses != undamaged
         assert all(value != 1.0 for value in found["noise"].ratios(0))
-    assert found["half"].undamaged == found["side"].undamaged != twins
-    # What twins do is what the worlds do that go on alone.
+    assert found["half"].undamaged == found["side"].undamaged != undamaged
+    # Undamaged copies do what worlds do that run without damaged ones.
     _, losses = trial.run(grown, trial.random(1001), trial.plan.heal_steps)
     alone = trial.by_seed(losses).T
-    assert torch.allclose(alone, torch.tensor(twins, dtype=torch.float64).to(alone), rtol=1e-5)
+    assert torch.allclose(alone, torch.tensor(undamaged, dtype=torch.float64).to(alone), rtol=1e-5)
 
 
 def test_conditions_are_grown_for_as_many_updates_and_left_out_where_too_large(device, monkeypatch):
@@ -346,8 +346,8 @@ def test_tables_say_what_was_not_measured_and_what_is_not_finite():
 
 
 def test_records_come_back_as_they_were_written_and_curves_are_drawn_by_task(tmp_path):
-    losses, twins = ((2.0, 1.0), (2.0, math.nan)), ((1.0, 1.0), (1.0, 1.0))
-    curve = trials.LossCurve("wipe", (0, 16), losses, twins)
+    losses, undamaged = ((2.0, 1.0), (2.0, math.nan)), ((1.0, 1.0), (1.0, 1.0))
+    curve = trials.LossCurve("wipe", (0, 16), losses, undamaged)
     records = [record(curve), record(curve, task="texture", rule="dots")]
     path = records[0].path = tmp_path / "robustness_heart.json"
     records[0].write()

@@ -9,7 +9,7 @@ import torch.nn.functional as F
 
 from npa_envs.cli import main
 from npa_envs.errors import NPAError
-from npa_envs.measure.texture_metric import AXES, DIRECTIONS, DISTANCES, TextureMetric, _images
+from npa_envs.measure.texture_metric import PAIR_DIRECTIONS, PAIR_DISTANCES, TextureMetric, _images
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2D, Morphogenesis2DConfig
 from npa_envs.tasks.targets.textures import TextureTarget, draw_pattern
 from npa_envs.tasks.texture import Texture, TextureConfig
@@ -91,11 +91,11 @@ def test_a_target_with_edges_is_not_read_across_them():
     half[:, :32, 0] = 1.0
     task = Texture(CONFIG, target=TextureTarget("half", half, False))
     metric = TextureMetric(task)
-    assert metric._patches.shape == (DIRECTIONS, 64 * 64)
+    assert metric._patches.shape == (len(metric._filters), 64 * 64)
     tiled = TextureMetric(Texture(CONFIG, target=TextureTarget("half", half, True)))
     assert float(tiled(task.drawing(0)).mean()) < 1.1
     # Its left edge is red and its right one black: only a torus has that step twice.
-    pair = DISTANCES.index(9) * len(AXES) + AXES.index((0, 1))
+    pair = PAIR_DISTANCES.index(9) * len(PAIR_DIRECTIONS) + PAIR_DIRECTIONS.index((0, 1))
     image = _images(half[None])
     same = [float(metric._counts(image, wrap)[pair].diagonal().sum()) for wrap in (True, False)]
     assert same[0] < same[1] - 0.01

@@ -49,7 +49,6 @@ class CheckResult:
     name: str = ""
     """Name of the check; `run_check` sets this field and those below."""
     expected: str = ""
-    """The result that the check expects, in a sentence."""
     seconds: float = 0.0
     """Duration [s]."""
     weights: str = ""
@@ -157,11 +156,7 @@ def check(
 
 
 def chosen_checks(checks: Sequence[Check], names: Sequence[str]) -> list[Check]:
-    """Return the checks that `names` select, or all checks if there are no names.
-
-    A name is that of a group or of a check, or the beginning of one up to a slash. One that selects
-    nothing raises NPAError.
-    """
+    """Return the checks of these groups or names, or beginnings of names; without names all."""
 
     def selects(name: str, check: Check) -> bool:
         return f"{check.name}/".startswith(f"{name.rstrip('/')}/")

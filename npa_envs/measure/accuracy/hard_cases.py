@@ -1,7 +1,4 @@
-"""Checks of perception where it is hard: positions, states, gradients, order and batches.
-
-The docstring of a check (`_run_...`) is the result that it expects, which reports show.
-"""
+"""Checks of perception where it is hard. The docstring of a check is the result that it expects."""
 
 from __future__ import annotations
 

@@ -129,27 +129,21 @@ def _far(space_dim: int, generator: torch.Generator) -> Tensor:
 
 
 POSITIONS: dict[str, tuple[str, Callable[[int, torch.Generator], Tensor]]] = {
-    "one": ("a single particle", lambda d, source: _uniform(d, source, 1)),
-    "coincident": (
-        "48 particles in one place",
-        lambda d, source: _uniform(d, source, 1).expand(1, 48, d),
-    ),
+    "one": ("a single particle", lambda d, g: _uniform(d, g, 1)),
+    "coincident": ("48 particles in one place", lambda d, g: _uniform(d, g, 1).expand(1, 48, d)),
     "touching": ("pairs from 1e-12 length units to ε/2 apart", _touching),
     "at_eps": ("pairs at ε, and at ε (1 ± 2⁻²⁰)", _at_eps),
     "collinear": ("particles on a line, straight and slanted", _collinear),
     "coplanar": ("particles on a plane", _coplanar),
     "lattice": (
         "a lattice of ε/2: neighbours at ε exactly",
-        lambda d, source: torch.cartesian_prod(*((torch.arange(5) - 2) * (EPS / 2.0),) * d)[None],
+        lambda d, g: torch.cartesian_prod(*((torch.arange(5) - 2) * (EPS / 2.0),) * d)[None],
     ),
     "cell_borders": (
         "particles on the borders of cells",
-        lambda d, source: torch.randint(-4, 4, (1, 60, d), generator=source) * (EPS / 2.0),
+        lambda d, g: torch.randint(-4, 4, (1, 60, d), generator=g) * (EPS / 2.0),
     ),
-    "clump": (
-        "100 particles in one cell",
-        lambda d, source: 0.03 + _uniform(d, source, 100, EPS / 4.0),
-    ),
+    "clump": ("100 particles in one cell", lambda d, g: 0.03 + _uniform(d, g, 100, EPS / 4.0)),
     "far": ("crowds at 0, 1e3, 1e6, -1e30 and 3e38", _far),
     "seam": ("particles on both sides of the box's seam and on it", _seam),
     "tight_box": ("particles in a box of exactly 2 ε", _tight_box),
@@ -263,8 +257,7 @@ def perceived(
 ) -> PerceptionOutcome:
     """Return the perception z of worlds and its gradients, by the library or the reference.
 
-    Gradients are of Σ z `weights`; None: of `functional_weights`. x, s and the weights are replaced
-    by `changed` of them first.
+    Gradients are of Σ z `weights`; None: of `functional_weights`. `changed` maps all inputs first.
     """
     x, s = changed(x.detach()).requires_grad_(), changed(s.detach()).requires_grad_()
     operator = reference.perceive if by_reference else perceive
@@ -279,8 +272,7 @@ def error_limits(x: Tensor, s: Tensor, box: Box, expected: PerceptionOutcome) ->
 
     An error may be four times the effect of rounding all inputs, which is large where sums cancel
     or results grow with 1 / distance. `expected` is the reference's outcome without rounding.
-    Coincident particles stay together. Positions in open space are rounded as if they were within
-    `SIDE` of the origin.
+    Coincident particles stay together; in open space coordinates are rounded as if within `SIDE`.
     """
     generator = torch.Generator().manual_seed(4)
     change = 1e-11

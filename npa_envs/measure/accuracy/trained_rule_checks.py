@@ -122,11 +122,9 @@ def mark_steps(steps: int) -> list[int]:
 
 
 def measured(runner: RuleRunner, worlds: Particles) -> dict[str, float]:
-    """Return metrics of worlds (maxima or means over them) by the names in `BOUNDS`, without drift.
+    """Return the metrics of `BOUNDS` except drift, before they are `relative`.
 
-    Extents are in length units, energies those of the next `ENERGY_STEPS` steps, which `runner`
-    runs; neither is relative to a settled world (see `relative`). If a number is infinite or NaN,
-    only `not_finite` is returned.
+    Energies are those of the next `ENERGY_STEPS` steps. NaN in x or s: `not_finite` only.
     """
     with torch.no_grad():
         x, s, *_ = worlds
@@ -205,10 +203,9 @@ GRADIENT_STEPS, QUICK_GRADIENT_STEPS = 512, 32
 
 
 class RolloutOutcome(NamedTuple):
-    """Positions and states after a rollout, and gradients of a random linear functional of them.
+    """Worlds after a rollout, and gradients of a random linear functional of them.
 
-    `by_weights` is the gradient by all W weights of the rule, [1, W]; `by_states` the gradient by
-    the initial states, [B, N, C].
+    Gradients are by all W weights of the rule, [1, W], and by the initial states, [B, N, C].
     """
 
     x: Tensor

@@ -1,7 +1,4 @@
-"""Losses of rules under other conditions and after damage: measurement, record, tables, pictures.
-
-The trained loss is that under the conditions of training.
-"""
+"""Losses of rules under other conditions and after damage: records, tables and pictures."""
 
 from __future__ import annotations
 
@@ -182,11 +179,7 @@ def grow(
 
 @torch.no_grad()
 def responses(trial: RuleTrial, trained: Response, *, done: int = 0) -> Iterator[Response]:
-    """Yield the losses at each value of each condition of the plan, without the first `done`.
-
-    At the values of training they are those of `trained`. Values that need more particles than
-    `MAX_PARTICLES`, or more memory than there is, are not measured.
-    """
+    """Yield the response at each value of each condition of the plan, without the first `done`."""
     every = [(name, value) for name, values in trial.plan.values.items() for value in values]
     trained_values = {"update_prob": trial.task.update_prob, "noise": 0.0, "shape": "trained"}
     for condition, value in every[done:]:
@@ -240,7 +233,6 @@ def tables(records: Sequence[RuleRecord]) -> str:
 
 
 def _by_damage(records: Sequence[RuleRecord]) -> str:
-    """Return a Markdown table by rule and damage: recovered seeds / seeds, and the median steps."""
     done = {curve.damage for record in records for curve in record.curves}
     names = [name for name in (CONTROL, *DAMAGES) if name in done]
     rows = []
@@ -255,10 +247,7 @@ def _by_damage(records: Sequence[RuleRecord]) -> str:
 
 
 def _by_value(records: Sequence[RuleRecord], condition: str) -> str:
-    """Return a Markdown table: each rule's trained loss, and loss / trained loss at each value.
-
-    If a trained loss is 0, its row has the losses themselves.
-    """
+    """Return a Markdown table by rule: the trained loss, and loss / trained loss at each value."""
     values = list(
         dict.fromkeys(r.value for record in records for r in record.responses_to(condition))
     )

@@ -228,10 +228,7 @@ class RuleTrial:
         return self._tasks[particle_count]
 
     def _by_task(self, x: Tensor) -> Iterator[tuple[Any, Tensor]]:
-        """Yield the task of each picture and the indices of its worlds in x, [m B, N, D].
-
-        x may have all B worlds m times, one copy after the other.
-        """
+        """Yield each picture's task and its worlds' indices in x, which may be several copies."""
         pictures = self._pictures.repeat(len(x) // self.world_count)
         tasks = self.tasks_of(x.shape[1])
         for k in sorted(set(pictures.tolist())):
@@ -329,10 +326,7 @@ def wipe(x: Tensor, s: Tensor, random: WorldRandom, box: Box) -> tuple[Tensor, T
 
 
 def slit(x: Tensor, s: Tensor, random: WorldRandom, box: Box) -> tuple[Tensor, Tensor]:
-    """Return x and s after a cut at a random angle, whose two sides move apart.
-
-    It goes through the centroid, in a periodic box through a random particle.
-    """
+    """Return x and s cut at a random angle through the centroid, in a box through any particle."""
     centre = world_mean(x) if box is None else random_particle(x, random)
     normal = random.normal(x.shape[2], dtype=x.dtype)
     change = partial(cut, normal=normal, gap=DAMAGE_SIZES["cut"])
@@ -400,10 +394,7 @@ MASKS_AFTER_DAMAGE, MASKS_OF_CONTROL = 1001, 1002
 
 @dataclass(frozen=True)
 class LossCurve:
-    """Losses of each seed at `steps` after a damage, and of its undamaged copy.
-
-    Losses are NaN from the step on at which a world is not finite.
-    """
+    """Losses of each seed at `steps` after a damage, and of its undamaged copy; NaN: not finite."""
 
     damage: str
     steps: tuple[int, ...]
@@ -436,8 +427,7 @@ def ratio(loss: float, reference: float) -> float:
 def healing(trial: RuleTrial, grown: Particles) -> list[LossCurve]:
     """Damage grown worlds in every way; return the loss curves of the control and of each damage.
 
-    If a damage removes half of the particles, undamaged copies are worlds that grew with half as
-    many from the start.
+    If a damage removes half of the particles, undamaged copies grew with half as many.
     """
     growth = trial.random(StreamId.GROWTH)
     smaller, _ = trial.run(trial.initial_worlds(0.5), growth, [trial.plan.grow_steps])

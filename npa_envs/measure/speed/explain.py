@@ -1,4 +1,4 @@
-"""The kernels of a step: their times (suite `kernels`), and why they were chosen."""
+"""The kernels of a step: their times (suite `kernels`), and why they were chosen (`explain`)."""
 
 from __future__ import annotations
 
@@ -24,10 +24,7 @@ from npa_envs.world.steps import row_capacity
 
 @dataclass(frozen=True)
 class KernelRow:
-    """One kernel in one workload: its total time [µs] and number of launches in a step.
-
-    Kernels that take less than 0.5 % of a step have no row.
-    """
+    """One kernel in a step of one workload: the time of all its launches [µs], and their number."""
 
     workload: str
     us: float
@@ -36,7 +33,10 @@ class KernelRow:
 
 
 def kernel_rows(session: TimingSession, workloads: Sequence[Workload]) -> list[KernelRow]:
-    """Return a row for each kernel of inference and of training; none on a CPU."""
+    """Return rows of the kernels of inference and of training on CUDA, the slowest first.
+
+    Kernels that take less than 0.5 % of a step have no row; on a CPU there are none.
+    """
     if not session.cuda:
         session.left_out["kernels"] = "CUDA only"
         return []
@@ -69,7 +69,7 @@ def kernel_rows(session: TimingSession, workloads: Sequence[Workload]) -> list[K
 
 
 Gradients = Literal["none", "weights", "positions"]
-"""Gradients of a step: none, by weights and states, or also by positions."""
+"""Which gradients a step computes: none, by weights and states, or also by positions."""
 
 
 def explain(
@@ -80,7 +80,7 @@ def explain(
     periodic: bool = False,
     gradients: Gradients = "weights",
 ) -> str:
-    """Run a step, and return as text which kernels it launched and why they were chosen."""
+    """Run a step, in a box if `periodic`; return which kernels it launched, and why, as text."""
     box = 2.0 * workload.half_width if periodic else None
     x, s = (tensor.to(dtype) for tensor in workload.worlds(device))
     rule = workload.rule(device).to(dtype)

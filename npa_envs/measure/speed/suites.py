@@ -1,4 +1,4 @@
-"""Suites of `npa-envs bench`: their workloads, tables, report and plots."""
+"""Suites of `npa-envs bench`: their workloads and tables, the report of a run, and plots."""
 
 from __future__ import annotations
 
@@ -42,23 +42,23 @@ PROFILED = (
     Workload(2, 8, 65536, 8),
     Workload(3, 4, 16384, 24, 256),
 )
-"""Workloads of the authors' own table."""
+"""Workloads of the table of the paper's authors."""
 
 PAPER = (*PROFILED, Workload(2, 1, 2**20, 8), Workload(2, 1, 2**24, 4))
-"""Workloads on CUDA; the last one is not trained."""
+"""Workloads of the suite `paper` on CUDA; of the last one only inference is measured."""
 
 CPU = (Workload(2, 1, 4096, 16), Workload(2, 4, 1024, 16))
-"""Workloads on a CPU."""
+"""Workloads of the suite `paper` on a CPU."""
 
 SMALL = (Workload(2, 1, 1024, 8),)
-"""Workloads of small sessions."""
+"""Workloads of the suite `quick`, on any device."""
 
 
 @dataclass(frozen=True)
 class ThroughputRow:
-    """Times of one step of a workload (B, N, T) [µs], with `memory` "store" or "recompute".
+    """Times of one step of a workload [µs], and peaks of memory without the worlds [MiB].
 
-    Peaks of memory [MiB] do not include the worlds.
+    `memory` is the option of `rollout`. Numbers that were not measured are None.
     """
 
     workload: str
@@ -71,7 +71,7 @@ class ThroughputRow:
 
 
 def throughput_rows(session: TimingSession, workloads: Sequence[Workload]) -> list[ThroughputRow]:
-    """Return two rows for each workload: "store" and "recompute"."""
+    """Return a row for each workload with memory="store", and one with "recompute" if trained."""
     calls = []
     for workload in workloads:
         train = workload != PAPER[-1]
@@ -87,7 +87,7 @@ def throughput_rows(session: TimingSession, workloads: Sequence[Workload]) -> li
 def throughput_row(
     session: TimingSession, workload: Workload, memory: Memory = "store", *, train: bool = True
 ) -> ThroughputRow:
-    """Return time and memory of a step of a workload."""
+    """Return times and memory of a step of a workload, without training unless `train`."""
     x, s = workload.worlds(session.device)
     roll, generator = rollout_call(workload, x, s)
     infer, training = session.cost(roll, generator=generator), None
@@ -107,9 +107,9 @@ def throughput_row(
 
 @dataclass(frozen=True)
 class PublicRow:
-    """Time of a step of `rollout` in a plain loop that synchronises after each call [µs].
+    """Times of a step of `rollout` [µs], whose calls are synchronised one by one.
 
-    The `launched` numbers are of calls with `cuda_graph=False`; the others replay a CUDA graph.
+    The `launched` ones are of calls with `cuda_graph=False`; the others replay a CUDA graph.
     """
 
     workload: str
@@ -142,12 +142,12 @@ AXES = {
     "worlds": "worlds B",
     "channels": "state channels C",
 }
-"""Varied quantities, with their labels in plots."""
+"""Quantities that are varied, by name, with their labels in plots."""
 
 
 @dataclass(frozen=True)
 class ScalingRow:
-    """Time and memory of one step of a 2D workload; `neighbours` include the particle itself."""
+    """Times [µs] and memory [MiB] of a step; `neighbours` is a mean, with the particle itself."""
 
     axis: str
     value: float
@@ -161,7 +161,7 @@ class ScalingRow:
 
 
 def scaling_rows(session: TimingSession) -> list[ScalingRow]:
-    """Return a row for each value of each of `AXES`, in increasing order."""
+    """Return a row for each value of each of `AXES`; values increase."""
     return session.rows(
         (f"{value} {axis}", partial(_scaling_row, session, axis, value))
         for axis, values in _axis_values(session).items()
@@ -174,17 +174,13 @@ def _axis_values(session: TimingSession) -> dict[str, Sequence[int]]:
         values: tuple[Sequence[int], ...] = (256, 1024), (16, 64), (1, 2), (4, 16)
     else:
         powers, worlds = (range(10, 21), 8) if session.cuda else (range(8, 17), 5)
-        values = (
-            [2**k for k in powers],
-            (8, 16, 32, 64, 128, 256),
-            [2**k for k in range(worlds)],
-            (4, 8, 16, 32, 64),
-        )
+        neighbours, channels = (8, 16, 32, 64, 128, 256), (4, 8, 16, 32, 64)
+        values = [2**k for k in powers], neighbours, [2**k for k in range(worlds)], channels
     return dict(zip(AXES, values, strict=True))
 
 
 def varied(axis: str, value: int, *, small: bool = False) -> Workload:
-    """Return the usual workload with another value of one of `AXES`."""
+    """Return the usual 2D workload, in which one of `AXES` has another value."""
     usual = Workload(2, 1, 512 if small else 4096, 4 if small else 8)
     if axis == "particles":
         return replace(usual, particle_count=value)
@@ -210,12 +206,12 @@ SKIPPED = {
     "cpu": Workload(2, 1, 4096, 4),
     "small": Workload(2, 1, 256, 2),
 }
-"""Workloads by `TimingSession.size`."""
+"""Workload of the suite by `TimingSession.size`."""
 
 
 @dataclass(frozen=True)
 class SkipRow:
-    """A computation that rollouts leave out; times of one step with and without it [µs]."""
+    """A computation that rollouts skip under a condition; times of a step with and without [µs]."""
 
     left_out: str
     condition: str
@@ -225,11 +221,11 @@ class SkipRow:
 
 
 Skip = tuple[str, str, dict[str, Any], dict[str, Any]]
-"""A computation, when it is left out, and options of `rollout_call` with and without it."""
+"""A computation, the condition to leave it out, and options of `rollout_call` with, without it."""
 
 
 def skips(workload: Workload) -> list[Skip]:
-    """Return all computations that rollouts can leave out."""
+    """Return all computations that rollouts of a workload can leave out."""
     side = 2.0 * workload.half_width
     training: dict[str, Any] = {"train": True}
     # Cells and densities are computed in each step if positions may have a gradient.
@@ -276,7 +272,7 @@ def skips(workload: Workload) -> list[Skip]:
 
 
 def skip_rows(session: TimingSession) -> list[SkipRow]:
-    """Return the time of a step with and without each computation that `skips` lists."""
+    """Return a row for each computation of `skips`."""
     workload = SKIPPED[session.size]
     x, s = workload.worlds(session.device)
 
@@ -301,15 +297,15 @@ SPECIES = {
     "cpu": (Workload(2, 1, 4096, 4), Workload(2, 1, 256, 4)),
     "small": (Workload(2, 1, 256, 2),),
 }
-"""Workloads by `TimingSession.size`; small ones show the cost of a call."""
+"""Workloads of the suite by `TimingSession.size`; ones of few particles show the cost of a call."""
 
 
 @dataclass(frozen=True)
 class OneSpeciesRow:
-    """Times of one step [µs] of `rollout`, and of `rollout_species` with one species.
+    """Times of a step [µs] of `rollout`, and of `rollout_species` with one species.
 
-    `calls` is "graph" for replays of a CUDA graph, else "eager". `ratio` is the second time / the
-    first.
+    `what` is "inference" or "training", `calls` "graph" for replays of a CUDA graph, else "eager".
+    `ratio` is the time of species / that of `rollout`.
     """
 
     workload: str
@@ -321,7 +317,7 @@ class OneSpeciesRow:
 
 
 def one_species_rows(session: TimingSession) -> list[OneSpeciesRow]:
-    """Return rows of inference and training."""
+    """Return rows of inference and training of each workload, on CUDA also by graphs."""
     return session.rows(
         (
             f"one species, {'training' if train else 'inference'} of {workload.name}",
@@ -348,17 +344,17 @@ def _species_row(
         run, generator = rollout_call(workload, x, s, train=train, roll=roll)
         cost = session.cost(run, graph=graph, generator=generator)
         times.append(cost.time.divided(workload.steps))
-    alone, species = times
+    plain, species = times
     what, calls = "training" if train else "inference", "graph" if graph else "eager"
-    ratio = species.median / alone.median
-    return OneSpeciesRow(workload.name, what, calls, alone, species, ratio)
+    ratio = species.median / plain.median
+    return OneSpeciesRow(workload.name, what, calls, plain, species, ratio)
 
 
 # The suites
 
 
 def paper(session: TimingSession) -> Tables:
-    """Return the tables `throughput` and, on CUDA, `public`: rows of the suite `paper`."""
+    """Return the tables of the suite `paper`: `throughput` and, on CUDA, `public`."""
     workloads = SMALL if session.small else PAPER if session.cuda else CPU
     tables: Tables = {"throughput": throughput_rows(session, workloads)}
     if session.cuda:
@@ -376,7 +372,7 @@ SUITES: dict[str, Callable[[TimingSession], Tables]] = {
     "species": lambda session: {"one_species": one_species_rows(session)},
     "kernels": lambda here: {"kernels": kernel_rows(here, SMALL if here.small else PROFILED)},
 }
-"""Functions that make the tables of each suite."""
+"""Suites by name: functions that measure and return their tables."""
 
 
 @dataclass(frozen=True)
@@ -390,10 +386,9 @@ class BenchReport:
     threads: int
     session: TimingSession
     tables: Tables
-    """Rows by the table's name."""
 
     def text(self) -> str:
-        """Return the tables as plain text."""
+        """Return the tables, and what was left out, as plain text."""
         parts = [f"{self.suite} on {machine(self.session.device)}, commit {self.commit}"]
         for name, rows in self.tables.items():
             parts.append(f"{name}:\n{table_text(rows, missing=UNMEASURED)}")
@@ -406,7 +401,7 @@ class BenchReport:
         return "\n\n".join(parts)
 
     def json(self) -> str:
-        """Return everything as JSON; a number that is not finite becomes null."""
+        """Return everything as JSON; infinite numbers and NaN become null."""
         content = {
             "suite": self.suite,
             "command": self.command,
@@ -422,7 +417,7 @@ class BenchReport:
 
 
 def pictures(tables: Tables) -> dict[str, bytes]:
-    """Return PNG files by name, if the table `scaling` has all axes. Needs matplotlib."""
+    """Return plots (PNG files by name) if the table `scaling` has all axes. Needs matplotlib."""
     rows = tables.get("scaling", [])
     if {row.axis for row in rows} != set(AXES):
         return {}
@@ -433,7 +428,7 @@ def pictures(tables: Tables) -> dict[str, bytes]:
 
 
 def _draw_scaling(table: Sequence[ScalingRow], unit: str, name: str) -> bytes:
-    """Return a PNG of the columns `infer_UNIT` and `train_UNIT`, called `name`, over each axis."""
+    """Return a PNG: columns `infer_UNIT` and `train_UNIT`, called `name`, over each of `AXES`."""
     figure, grid = new_figure(2, 2, (9.2, 7.6))
     for axis, panel in zip(AXES, grid.flat, strict=True):
         rows = [row for row in table if row.axis == axis]

@@ -1,4 +1,4 @@
-"""Workloads, time and memory of a call, and the session of a benchmark."""
+"""Workloads of `npa-envs bench`, time and memory of a call, and the session of a run."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ from npa_envs.world.rollout import rollout
 
 @dataclass(frozen=True)
 class Workload:
-    """B worlds of N uniformly scattered particles for a rollout of T steps, and a fresh rule.
+    """A rollout of T steps: B worlds of N uniformly scattered particles, and an untrained rule.
 
-    `eps` [length units] is such that particles have about 66 neighbours in 2D.
+    With the default radius `eps` [length units] particles have about 66 neighbours in 2D.
     """
 
     space_dim: int
@@ -38,19 +38,19 @@ class Workload:
 
     @property
     def name(self) -> str:
-        """Short name: dimension and (B, N, T)."""
+        """Space dimension and (B, N, T), such as "2D (8, 4096, 64)"."""
         return f"{self.space_dim}D ({self.world_count}, {self.particle_count}, {self.steps})"
 
     @property
     def half_width(self) -> float:
-        """Half the side of the square or cube of particles [length units], by a fixed density."""
+        """Half the side of the square or cube of particles [length units], at a fixed density."""
         if self.space_dim == 2:
             return 0.7 * math.sqrt(self.particle_count / 4096)
         return 0.8 * math.cbrt(self.particle_count / 16384)
 
     @property
     def neighbour_count(self) -> float:
-        """Mean number of particles within eps of one, itself included, far from the edges."""
+        """Mean number of particles within `eps` of one far from the edges, itself included."""
         ball = math.pi * self.eps**2 if self.space_dim == 2 else 4 / 3 * math.pi * self.eps**3
         volume = math.prod((2.0 * self.half_width,) * self.space_dim)
         return 1.0 + self.particle_count * ball / volume
@@ -64,7 +64,7 @@ class Workload:
         return x.mul_(2.0).sub_(1.0).mul_(self.half_width), s.mul_(0.1)
 
     def rule(self, device: torch.device, **options: Any) -> NPARule:
-        """Return a new rule, always with the same weights, with options of `NPARule`."""
+        """Return a new rule, always with the same weights; `options` are those of `NPARule`."""
         # Weights are drawn from torch's global generators, whose state must not change.
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(0)
@@ -84,17 +84,18 @@ def rollout_call(
     roll: Callable[..., Any] = rollout,
     **options: Any,
 ) -> tuple[Callable[[], None], torch.Generator]:
-    """Return a function that runs a rollout, and the generator of its masks.
+    """Return a function that runs a workload's rollout from x and s, and its masks' generator.
 
-    `train` computes the gradient of a random linear functional by the rule's weights, `gradients`
-    only enables gradients. `rule` are options of the rule, `options` those of `roll`.
+    With `train` it also computes the gradient of a random linear functional of the result by the
+    rule's weights; with `gradients` it only records what a gradient needs. `rule` are options of
+    `NPARule`, `options` those of `roll`, the function that is timed.
     """
     network = workload.rule(x.device, **(rule or {}))
     generator = torch.Generator(x.device).manual_seed(1)
     kwargs = {"eps": workload.eps, "update_prob": workload.update_prob, **options}
-    draws = torch.Generator(x.device).manual_seed(2)
+    source = torch.Generator(x.device).manual_seed(2)
     weights = [
-        torch.randn(worlds.shape, generator=draws, device=x.device)
+        torch.randn(worlds.shape, generator=source, device=x.device)
         for worlds in ((x, s) if train else ())
     ]
 
@@ -111,19 +112,19 @@ def rollout_call(
 # Time
 
 MIN_SECONDS = {"cpu": 2e-3, "cuda": 1e-2}
-"""Least duration of a reading, for which short calls are repeated [s]."""
+"""Minimum duration of a reading [s], by kind of device; short calls are repeated within it."""
 
 
 @dataclass(frozen=True)
 class Timing:
-    """The time of one call [µs]: the median of several readings, and the range of all of them."""
+    """Time of one call [µs]: the median, the lowest and the highest of several readings."""
 
     median: float
     low: float
     high: float
 
     def __str__(self) -> str:
-        """Return the median and the largest deviation of a reading, as text."""
+        """Return the median and the largest deviation from it, such as "12.5 ±3%"."""
         off = max(self.high - self.median, self.median - self.low) / self.median
         return f"{self.median:.4g} ±{off:.0%}"
 
@@ -134,14 +135,14 @@ class Timing:
 
 @dataclass(frozen=True)
 class Cost:
-    """The time of a call, and its peak of memory allocated by torch [MiB], None on a CPU."""
+    """Time of a call, and the peak of memory that torch allocates in it [MiB]; None on a CPU."""
 
     time: Timing
     peak_mib: float | None
 
 
 def synchronize(device: torch.device) -> None:
-    """Wait for all work of a device, if it is CUDA."""
+    """Wait until a CUDA device has done all its work; on a CPU do nothing."""
     if device.type == "cuda":
         torch.cuda.synchronize(device)
 
@@ -149,7 +150,7 @@ def synchronize(device: torch.device) -> None:
 def timed(
     run: Callable[[], object], device: torch.device, repeats: int, *, calls: int | None = None
 ) -> Timing:
-    """Return a call's time: up to `repeats` readings of `calls` calls, or of `MIN_SECONDS`."""
+    """Return a call's time: each reading is a mean of `calls` calls; None: of `MIN_SECONDS`."""
 
     def reading(count: int) -> float:
         synchronize(device)
@@ -172,28 +173,28 @@ def timed(
 Row = TypeVar("Row")
 
 Tables = dict[str, list[Any]]
-"""Rows of a suite, instances of one dataclass each, by the table's name."""
+"""Tables by name: lists of rows, which are instances of one dataclass."""
 
 
 NO_TIME = "no time was left"
-"""Reason for measurements that had not started at the time limit."""
+"""Why measurements that had not started at the time limit were left out."""
 
 
 @dataclass
 class TimingSession:
-    """Options of one run of `npa-envs bench`, and what it left out."""
+    """Options of one run of `npa-envs bench`, and the measurements that it left out."""
 
     device: torch.device
     repeats: int = 7
-    """Readings of every time."""
+    """Maximum number of readings of a time (`timed`)."""
     small: bool = False
-    """Small sizes only."""
+    """Whether only small worlds are measured."""
     progress: Callable[[int], None] = lambda done: None
     """Called with 1 after each row."""
     left_out: dict[str, str] = field(default_factory=dict)
-    """The reason by measurement that was left out."""
+    """Name of each measurement that was left out, and the reason."""
     enough: Callable[[], bool] = lambda: False
-    """Returns whether the time limit is reached: later rows are left out."""
+    """Returns whether the time limit is reached; then no further row is measured."""
 
     @property
     def cuda(self) -> bool:
@@ -202,7 +203,7 @@ class TimingSession:
 
     @property
     def size(self) -> str:
-        """Size of workloads: "small", "cpu" or "cuda"."""
+        """Which workloads are measured: "small", "cpu" or "cuda"."""
         return "small" if self.small else self.device.type
 
     def cost(
@@ -212,7 +213,7 @@ class TimingSession:
         graph: bool = True,
         generator: torch.Generator | None = None,
     ) -> Cost:
-        """Return time and memory of a call after a first one; `graph`: of replays on CUDA."""
+        """Return time and memory of calls after a first one; with `graph`, of replays on CUDA."""
         device = self.device
         run()
         synchronize(device)
@@ -227,7 +228,7 @@ class TimingSession:
         return Cost(timing, (torch.cuda.max_memory_allocated(device) - before) / 2**20)
 
     def attempt(self, what: str, make: Callable[[], Row]) -> list[Row]:
-        """Return a list of the row that `make` returns, empty if memory or time is short."""
+        """Return [make()]; if memory or time does not suffice, [], with `what` in `left_out`."""
         if self.enough():
             self.left_out[what] = NO_TIME
             return []
@@ -240,5 +241,5 @@ class TimingSession:
         return []
 
     def rows(self, calls: Iterable[tuple[str, Callable[[], Row]]]) -> list[Row]:
-        """Return the rows that `calls` (name, function) return, where memory and time allow."""
+        """Return the rows of `calls`, pairs of a name and a function, by `attempt`."""
         return [row for what, make in calls for row in self.attempt(what, make)]
