@@ -54,7 +54,7 @@ def domain_types(space_dim: int, scalar: type) -> SimpleNamespace:
     """
     vector = wp.types.vector(space_dim, scalar)
     cell_vector = wp.types.vector(space_dim, wp.int32)
-    double_vector = wp.types.vector(space_dim, wp.float64)
+    vector_f64 = wp.types.vector(space_dim, wp.float64)
     particle = wp.types.vector(space_dim + 1, scalar)
 
     @wp.struct
@@ -67,7 +67,7 @@ def domain_types(space_dim: int, scalar: type) -> SimpleNamespace:
         periodic: int
         box: vector
         inverse_box: vector
-        cell_scale: double_vector
+        cell_scale: vector_f64
         cell_shape: cell_vector
         cell_count: int
         cells_per_eps: int
@@ -186,7 +186,7 @@ def domain_types(space_dim: int, scalar: type) -> SimpleNamespace:
     @wp.func
     def difference_f64(domain: Domain, centre: vector, neighbour: vector):
         """Return the minimum image of neighbour - centre, in float64 [length units]."""
-        result = double_vector()
+        result = vector_f64()
         for d in range(wp.static(space_dim)):
             result[d] = wp.float64(neighbour[d]) - wp.float64(centre[d])
             if domain.periodic != 0:
@@ -200,7 +200,20 @@ def domain_types(space_dim: int, scalar: type) -> SimpleNamespace:
             result[d] = entry[d]
         return result
 
-    return native.namespace(locals(), vector=vector, particle=particle, Domain=Domain)
+    types = {"vector": vector, "vector_f64": vector_f64, "cell_vector": cell_vector}
+    return native.namespace(locals(), **types, particle=particle, Domain=Domain)
+
+
+@cached_under_lock()
+def group_types(space_dim: int, scalar: type, width: int) -> SimpleNamespace:
+    """Return `domain_types`, its arguments, and the types of a group of `width` channels."""
+    return SimpleNamespace(
+        **vars(domain_types(space_dim, scalar)),
+        **{"space_dim": space_dim, "scalar": scalar, "width": width},
+        group=wp.types.vector(width, scalar),
+        group_gradient=wp.types.matrix((space_dim, width), scalar),
+        square=wp.types.matrix((space_dim, space_dim), scalar),
+    )
 
 
 @functools.lru_cache(maxsize=256)

@@ -25,7 +25,6 @@ WARP = 32
 CUDA_BLOCK = 128
 """Default number of threads of a block."""
 
-
 wait_for_previous_kernel = native.function("wait_for_previous_kernel")
 """Wait for earlier launches; kernels call it first, before they access memory.
 
@@ -129,16 +128,11 @@ thread_number = native.function("thread_number", returns=int)
 """This thread's index in the launch, without the divisions of `wp.tid`."""
 
 block_number = native.function("block_number", returns=int)
-"""This block's index in the launch."""
-
 thread_of_block = native.function("thread_of_block", returns=int)
-"""This thread's index in its block."""
+"""This block's index in the launch, and this thread's index in its block."""
 
-sync_block = native.function("sync_block")
-"""Synchronize the threads of the block, and make their writes visible to each other."""
-
-sync_warp = native.function("sync_warp")
-"""Synchronize the threads of the warp, and make their writes visible to each other."""
+sync_block, sync_warp = native.function("sync_block"), native.function("sync_warp")
+"""Synchronize the threads of the block or warp, and make their writes visible to each other."""
 
 any_in_warp = native.function("any_in_warp", condition=bool, returns=bool)
 """Whether a condition is true for some thread of the warp."""
@@ -159,7 +153,5 @@ thread_of = native.function("thread_of", ends=int, number=int, returns=int)
 """The first thread of the warp whose `ends` is above `number`; `ends` must ascend."""
 
 as_number = native.function("as_number", word=float, returns=int)
-"""The integer whose bits are those of a float32."""
-
 as_word = native.function("as_word", number=int, returns=float)
-"""The float32 whose bits are those of an integer."""
+"""The int32 with the bits of a float32, and the float32 with the bits of an int32."""

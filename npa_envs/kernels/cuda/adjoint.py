@@ -58,7 +58,6 @@ MAX_LENGTH = 3.4028234663852886e38
 
 load_channels = make_wide_load(CHANNELS)
 
-
 row_list_address = native.function(
     "row_list_address", CUDA_BLOCK // WARP, LIST_ENTRIES, returns=wp.uint32
 )
@@ -103,8 +102,7 @@ def row_search(space_dim: int, periodic: bool) -> SimpleNamespace:
     """Return the functions that list the runs of cells around 8 particles and test their rows."""
     scalar = wp.float32
     space = domain_types(space_dim, scalar)
-    vector, Domain = space.vector, space.Domain
-    cell_vector = wp.types.vector(space_dim, wp.int32)
+    vector, cell_vector, Domain = space.vector, space.cell_vector, space.Domain
 
     @wp.func
     def line_of(domain: Domain, cell: cell_vector):
@@ -209,7 +207,6 @@ def row_search(space_dim: int, periodic: bool) -> SimpleNamespace:
 
     @wp.func
     def is_finite(position: vector):
-        """Return whether all coordinates are finite."""
         finite = wp.bool(True)
         for d in range(wp.static(space_dim)):
             finite = finite and wp.isfinite(position[d])
@@ -239,23 +236,16 @@ def listed_adjoint(
     search = row_search(space_dim, periodic)
     parts = width // THREAD_CHANNELS
     # Of a warp's 8 particles: the sum of the listed rows' cotangents, weighted by kernels.
-    sum_listed = native.function(
-        "sum_listed",
-        *(space_dim, width, weight_count, periodic),
-        address=wp.uint32,
-        count=int,
-        domain=Domain,
-        position=vector,
-        channels=wp.array[scalar],
-        value=CHANNELS,
-        returns=CHANNELS,
-    )
+    rows = {"address": wp.uint32, "count": int, "domain": Domain, "position": vector}
+    values = {"channels": wp.array[scalar], "value": CHANNELS}
+    sizes = space_dim, width, weight_count, periodic
+    sum_listed = native.function("sum_listed", *sizes, **rows, **values, returns=CHANNELS)
     log_scale_cotangent = native.function(
         "log_scale_cotangent", scaled=vector, cotangent=vector, returns=vector
     )
     read_gradients = make_read_columns(THREAD_CHANNELS * space_dim)
 
-    @wp.kernel(enable_backward=False, module=module, grid_stride=False)
+    @wp.kernel(module=module, grid_stride=False)
     def unscale_cotangents(
         state_dim: int,
         gradient_scale: scalar,
@@ -304,9 +294,7 @@ def listed_adjoint(
                 for d in range(wp.static(space_dim)):
                     wide_store(cotangents, index + (d + 1) * wp.static(parts), gradient_bars[d])
 
-    @wp.kernel(
-        enable_backward=False, module=module, cuda_max_registers=CUDA_REGISTERS, grid_stride=False
-    )
+    @wp.kernel(module=module, cuda_max_registers=CUDA_REGISTERS, grid_stride=False)
     def gather_state_cotangents(
         domain: Domain,
         norm: scalar,
@@ -414,12 +402,7 @@ def listed_adjoint(
                             nothing = search.row_entry(origin, row_capacity * group_count)
                             summed_count = pad_list(address, count, nothing)
                         block_sums = sum_listed(
-                            address,
-                            summed_count,
-                            domain,
-                            position,
-                            flat_cotangents,
-                            block_sums,
+                            address, summed_count, domain, position, flat_cotangents, block_sums
                         )
                         keep_unsummed(address, summed_count, count)
                         count = wp.max(count - summed_count, 0)

@@ -123,13 +123,9 @@ def listed_density(
         return wp.max(first + 2, 0), wp.max(2 - last, 0)
 
     options = {"lanes": lanes, "periodic": periodic, "capacity": capacity, "masked": masked}
+    module = kernel_module("listed_density", space_dim, scalar, **options)
 
-    @wp.kernel(
-        enable_backward=False,
-        module=kernel_module("listed_density", space_dim, scalar, **options),
-        cuda_max_registers=CUDA_REGISTERS,
-        grid_stride=False,
-    )
+    @wp.kernel(module=module, cuda_max_registers=CUDA_REGISTERS, grid_stride=False)
     def compute_density(
         domain: Domain,
         starts: wp.array[wp.int32],
@@ -255,33 +251,18 @@ def tiled_density(periodic: bool, capacity: int, masked: bool) -> wp.Kernel:
     """
     space = domain_types(2, wp.float32)
     vector, particle, Domain = space.vector, space.particle, space.Domain
-    load_vector = make_wide_load(vector)
-
+    load_vector, integers = make_wide_load(vector), wp.array[wp.int32]
+    cells = {"starts": integers, "sorted_cell": integers, "sorted_positions": wp.array[vector]}
+    place = {"base": int, "first": int, "k": int, "inside": bool, "row": int}
+    arguments = {"domain": Domain, **cells, **place, "lists": wp.array3d[wp.int16]}
+    arguments["list_lengths"] = integers
     density_of_tile = native.function(
-        "density_of_tile",
-        *(capacity, periodic),
-        domain=Domain,
-        starts=wp.array[wp.int32],
-        sorted_cell=wp.array[wp.int32],
-        sorted_positions=wp.array[vector],
-        base=int,
-        first=int,
-        k=int,
-        inside=bool,
-        row=int,
-        lists=wp.array3d[wp.int16],
-        list_lengths=wp.array[wp.int32],
-        returns=float,
+        "density_of_tile", capacity, periodic, **arguments, returns=float
     )
-
     options = {"periodic": periodic, "capacity": capacity, "masked": masked}
+    module = kernel_module("tiled_density", 2, wp.float32, **options)
 
-    @wp.kernel(
-        enable_backward=False,
-        module=kernel_module("tiled_density", 2, wp.float32, **options),
-        cuda_max_registers=TILE_REGISTERS,
-        grid_stride=False,
-    )
+    @wp.kernel(module=module, cuda_max_registers=TILE_REGISTERS, grid_stride=False)
     def compute_density(
         domain: Domain,
         particle_count: int,

@@ -67,7 +67,7 @@ def row_kernels(
         untyped="rows mixing mixed mixed_bar inputs_bar rows_bar partial_sums",
     )
 
-    @wp.kernel(enable_backward=False, module=module)
+    @wp.kernel(module=module)
     def read_rows(
         rows: wp.array2d[wp.float32],
         mixing: wp.array[wp.float32],
@@ -79,7 +79,7 @@ def row_kernels(
         wait_for_previous_kernel()
         read_vectors(rows, mixing, mixed, inputs)
 
-    @wp.kernel(enable_backward=False, module=module)
+    @wp.kernel(module=module)
     def pull_back_rows(
         rows: wp.array2d[wp.float32],
         mixing: wp.array[wp.float32],
@@ -103,12 +103,9 @@ def mixing_sum() -> wp.Kernel:
     add_partial_sums = native.function(
         "add_partial_sums", MIXING_SUM_WARPS, untyped="partial_sums total"
     )
+    module = native.module("npa_envs.kernels.vector_sums")
 
-    @wp.kernel(
-        enable_backward=False,
-        module=native.module("npa_envs.kernels.vector_sums"),
-        launch_bounds=MIXING_SUM_WARPS * WARP,
-    )
+    @wp.kernel(module=module, launch_bounds=MIXING_SUM_WARPS * WARP)
     def add_blocks(
         partial_sums: wp.array2d[wp.float32],
         # outputs
@@ -136,7 +133,7 @@ def steering_kernels(space_dim: int, mixed_count: int, chiral: bool) -> SimpleNa
         "pull_back_gates", *sizes, untyped="output mixed signs update_bar output_bar mixed_bar"
     )
 
-    @wp.kernel(enable_backward=False, module=module)
+    @wp.kernel(module=module)
     def steer(
         output: wp.array2d[wp.float32],
         mixed: wp.array[wp.float32],
@@ -148,7 +145,7 @@ def steering_kernels(space_dim: int, mixed_count: int, chiral: bool) -> SimpleNa
         wait_for_previous_kernel()
         steer_by_gates(output, mixed, signs, update)
 
-    @wp.kernel(enable_backward=False, module=module)
+    @wp.kernel(module=module)
     def pull_back_steering(
         output: wp.array2d[wp.float32],
         mixed: wp.array[wp.float32],

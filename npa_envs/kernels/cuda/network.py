@@ -21,14 +21,9 @@ ROW_TARGET, UNIT_TARGET, OUTPUT_TARGET = 8, 4, 7
 
 A hidden unit is then below 2^(8 + 1 + 4 + 1), in the range of float16, with a far smaller error."""
 
-ROW_TILE = 32
-"""Rows of a block's weight gradients between two barriers."""
-
-WARP_UNITS = 32
-"""Hidden units whose weight gradients one warp sums."""
-
-SUM_WARPS = 4
-"""Warps of a block that adds partial sums."""
+ROW_TILE, WARP_UNITS, SUM_WARPS = 32, 32, 4
+"""Of weight gradients: rows that a block sums between two barriers, hidden units of one warp, and
+warps of a block that adds partial sums."""
 
 LAYER_REGISTERS, GRADIENT_REGISTERS = 168, 255
 """Registers per thread of the layer kernels and of the weight gradient kernels."""
@@ -59,7 +54,7 @@ def two_layer_kernel(steps: int, tiles: int, mode: str) -> wp.Kernel:
         untyped="unit_count rows hidden_weights output_weights output_unscale signs output",
     )
 
-    @wp.kernel(enable_backward=False, module=native.module(name), cuda_max_registers=registers)
+    @wp.kernel(module=native.module(name), cuda_max_registers=registers)
     def network_layers(
         unit_count: int,
         rows: wp.array2d[wp.float32],
@@ -100,7 +95,7 @@ def weight_gradient_kernels(
     )
     add_partial_sums = native.function("add_partial_sums", SUM_WARPS, untyped="partial_sums total")
 
-    @wp.kernel(enable_backward=False, module=module, cuda_max_registers=GRADIENT_REGISTERS)
+    @wp.kernel(module=module, cuda_max_registers=GRADIENT_REGISTERS)
     def sum_weight_gradients(
         unit_count: int,
         part_rows: int,
@@ -126,7 +121,7 @@ def weight_gradient_kernels(
             partial_sums,
         )
 
-    @wp.kernel(enable_backward=False, module=module)
+    @wp.kernel(module=module)
     def add_parts(
         partial_sums: wp.array2d[wp.float32],
         # outputs
@@ -152,7 +147,7 @@ def arrangement_kernels() -> SimpleNamespace:
     """
     module = native.module("npa_envs.kernels.network_arrangement")
 
-    @wp.kernel(enable_backward=False, module=module)
+    @wp.kernel(module=module)
     def arrange_hidden(
         weights: wp.array2d[wp.float32],
         # outputs
@@ -179,7 +174,7 @@ def arrangement_kernels() -> SimpleNamespace:
             fragments[first + i] = high
             fragments[first + 4 + i] = wp.float16(value - wp.float32(high))
 
-    @wp.kernel(enable_backward=False, module=module)
+    @wp.kernel(module=module)
     def arrange_output(
         weights: wp.array2d[wp.float32],
         unit_unscale: wp.array[wp.float32],
@@ -208,7 +203,7 @@ def arrangement_kernels() -> SimpleNamespace:
             fragments[first + i] = high
             fragments[first + 4 + i] = wp.float16(value - wp.float32(high))
 
-    @wp.kernel(enable_backward=False, module=module)
+    @wp.kernel(module=module)
     def arrange_left(
         weights: wp.array2d[wp.float32],
         # outputs

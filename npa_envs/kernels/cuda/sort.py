@@ -44,7 +44,6 @@ MAX_GRID = 4096
 THREAD_CHANNELS = 4
 """Adjacent channels that a thread moves."""
 
-
 count_active = native.function("count_active", mask=wp.array[wp.uint8], count=int, returns=int)
 """The number of active particles in this thread's part of `mask`, up to `count`."""
 
@@ -85,12 +84,9 @@ def sort_small_worlds(space_dim: int, capacity: int) -> wp.Kernel:
     load_vector = make_wide_load(vector)
     read_channels = make_read_channels(channels)
     sorting = block_functions(capacity)
+    module = kernel_module("small_worlds", space_dim, scalar, capacity=capacity)
 
-    @wp.kernel(
-        enable_backward=False,
-        launch_bounds=(block, RESIDENT_THREADS // block),
-        module=kernel_module("small_worlds", space_dim, scalar, capacity=capacity),
-    )
+    @wp.kernel(module=module, launch_bounds=(block, RESIDENT_THREADS // block))
     def sort_worlds(
         domain: Domain,
         particle_count: int,
@@ -213,15 +209,11 @@ def sort_small_splats(capacity: int) -> wp.Kernel:
     View, vector, footprint_type = types.View, types.vector, types.footprint
     load_vector = make_wide_load(vector)
     sorting = block_functions(capacity)
-
     world = {"positions": wp.array[vector], "first": int, "count": int}
     mean_of_world = native.function("mean_of_world", capacity, CHUNK, **world, returns=vector)
+    module = native.module(f"npa_envs.kernels.small_splats_{capacity}")
 
-    @wp.kernel(
-        enable_backward=False,
-        launch_bounds=(block, RESIDENT_THREADS // block),
-        module=native.module(f"npa_envs.kernels.small_splats_{capacity}"),
-    )
+    @wp.kernel(module=module, launch_bounds=(block, RESIDENT_THREADS // block))
     def sort_splats(
         view: View,
         slice_count: int,
@@ -297,7 +289,7 @@ def order_particles(space_dim: int, width: int) -> wp.Kernel:
     held_type = wp.types.matrix((CUDA_LANES, thread_width), scalar)
     read_channels = make_read_channels(channels)
 
-    @wp.kernel(enable_backward=False, module=kernel_module("order", space_dim, scalar, width=width))
+    @wp.kernel(module=kernel_module("order", space_dim, scalar, width=width))
     def order_particles(
         positions: wp.array[vector],
         state_dim: int,

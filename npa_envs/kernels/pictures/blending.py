@@ -164,7 +164,7 @@ def tile_kernels(scalar: type) -> SimpleNamespace:
         )
 
     @in_ranges(TILES)
-    @wp.kernel(enable_backward=False, module=module)
+    @wp.kernel(module=module)
     def draw_tiles(
         range_start: int,
         frame: Frame,
@@ -206,7 +206,7 @@ def tile_kernels(scalar: type) -> SimpleNamespace:
                                 picture[pixel, c] = picture[pixel, c] + added
 
     @in_ranges(TILES)
-    @wp.kernel(enable_backward=False, module=module)
+    @wp.kernel(module=module)
     def pull_back_tiles(
         range_start: int,
         frame: Frame,
@@ -281,7 +281,7 @@ def block_kernels(scalar: type) -> SimpleNamespace:
         row += patch / across * wp.static(PATCH_HEIGHT) + lane / wp.static(PATCH_WIDTH)
         return column, row
 
-    @wp.kernel(enable_backward=False, module=drawing_module)
+    @wp.kernel(module=drawing_module)
     def draw_blocks(
         frame: Frame,
         starts: wp.array[wp.int32],
@@ -323,7 +323,7 @@ def block_kernels(scalar: type) -> SimpleNamespace:
             passing[pixel] = through
             stops[pixel] = stop
 
-    @wp.kernel(enable_backward=False, module=adjoint_module)
+    @wp.kernel(module=adjoint_module)
     def pull_back_blocks(
         frame: Frame,
         starts: wp.array[wp.int32],

@@ -271,16 +271,20 @@ def gaussian_functions(scalar: type) -> SimpleNamespace:
 @cached_under_lock()
 def gaussian_kernels(scalar: type) -> SimpleNamespace:
     """Return the kernels that project 3D Gaussians, list the tiles they cover, and the adjoint."""
-    types, gaussian = gaussian_types(scalar), gaussian_functions(scalar)
-    Frame, pair, triple, quad = types.Frame, types.pair, types.triple, types.quad
-    footprint_type, bar_type, harmonics_type = types.footprint, types.tile_bar, types.harmonics
-    square, cube, motion_type = types.square, types.cube, types.motion
     module = native.module(f"npa_envs.kernels.gaussians_{scalar_name(scalar)}")
+    adjoint = adjoint_kernel(scalar, module)
+    return SimpleNamespace(**vars(projection_kernels(scalar, module)), pull_back_gaussians=adjoint)
+
+
+def projection_kernels(scalar: type, module: wp.Module) -> SimpleNamespace:
+    """Return the kernels that project Gaussians and list the tiles that these cover."""
+    types, gaussian = gaussian_types(scalar), gaussian_functions(scalar)
+    Frame, triple, quad = types.Frame, types.triple, types.quad
+    footprint_type, motion_type = types.footprint, types.motion
     load_footprint = make_wide_load(footprint_type)
-    load_tile_bar = make_wide_load(bar_type)
 
     @in_ranges(PAIRS)
-    @wp.kernel(enable_backward=False, module=module)
+    @wp.kernel(module=module)
     def project_gaussians(
         range_start: int,
         frame: Frame,
@@ -354,7 +358,7 @@ def gaussian_kernels(scalar: type) -> SimpleNamespace:
         counts[entry] = count
 
     @in_ranges(PAIRS)
-    @wp.kernel(enable_backward=False, module=module)
+    @wp.kernel(module=module)
     def list_pairs(
         range_start: int,
         frame: Frame,
@@ -392,8 +396,19 @@ def gaussian_kernels(scalar: type) -> SimpleNamespace:
                     next_slot += 1
         slots[entry] = slot
 
+    return namespace(locals())
+
+
+def adjoint_kernel(scalar: type, module: wp.Module) -> wp.Kernel:
+    """Return the kernel of the cotangents of Gaussians, from those of the tiles they cover."""
+    types, gaussian = gaussian_types(scalar), gaussian_functions(scalar)
+    Frame, pair, triple, quad = types.Frame, types.pair, types.triple, types.quad
+    footprint_type, bar_type, harmonics_type = types.footprint, types.tile_bar, types.harmonics
+    square, cube, motion_type = types.square, types.cube, types.motion
+    load_footprint, load_tile_bar = make_wide_load(footprint_type), make_wide_load(bar_type)
+
     @in_ranges(PAIRS)
-    @wp.kernel(enable_backward=False, module=module)
+    @wp.kernel(module=module)
     def pull_back_gaussians(
         range_start: int,
         frame: Frame,
@@ -506,4 +521,4 @@ def gaussian_kernels(scalar: type) -> SimpleNamespace:
                 for c in range(3):
                     colours_bar[i, 3 * k + c] = harmonics_bar[k, c]
 
-    return namespace(locals())
+    return pull_back_gaussians

@@ -158,6 +158,15 @@ def splat_functions(scalar: type) -> SimpleNamespace:
         )
 
     @wp.func
+    def position_in_world(
+        view: View, position: vector, means: wp.array[vector], goal: wp.array[vector], world: int
+    ):
+        mean = vector()
+        if goal.shape[0] > 0:
+            mean = means[world]
+        return pixel_position(view, position, mean, goal)
+
+    @wp.func
     def patch_centre(position: vector):
         return vector(wp.floor(position[0] + scalar(0.5)), wp.floor(position[1] + scalar(0.5)))
 
@@ -301,28 +310,21 @@ def gather_functions(scalar: type, lanes: int) -> SimpleNamespace:
 @cached_under_lock()
 def splat_kernels(scalar: type, lanes: int) -> SimpleNamespace:
     """Return the kernels that draw worlds, and the adjoint; `lanes` threads a tile or particle."""
-    types = splat_types(scalar)
-    View, vector, colour_type = types.View, types.vector, types.colour
-    footprint_type, bar_type = types.footprint, types.splat_bar
-    group_tiles = GROUP_WIDTH * GROUP_HEIGHT
-    lane_pixels = TILE_WIDTH * TILE_HEIGHT // lanes
     module = native.module(f"npa_envs.kernels.splat_{scalar_name(scalar)}_l{lanes}")
-    load_footprint = make_wide_load(footprint_type)
-    load_colour = make_wide_load(colour_type)
-    lane_sum = make_lane_sum(bar_type, lanes)
-    splat = splat_functions(scalar)
-    gather_tile = gather_functions(scalar, lanes).gather_tile
+    return SimpleNamespace(
+        **vars(sorting_kernels(scalar, module)),
+        gather_splats=gathering_kernel(scalar, lanes, module),
+        scatter_splats=scattering_kernel(scalar, module),
+        pull_back_splats=adjoint_kernel(scalar, lanes, module),
+    )
 
-    @wp.func
-    def position_in_world(
-        view: View, position: vector, means: wp.array[vector], goal: wp.array[vector], world: int
-    ):
-        mean = vector()
-        if goal.shape[0] > 0:
-            mean = means[world]
-        return splat.pixel_position(view, position, mean, goal)
 
-    @wp.kernel(enable_backward=False, module=module)
+def sorting_kernels(scalar: type, module: wp.Module) -> SimpleNamespace:
+    """Return the kernels that sort particles' footprints by cells."""
+    types, splat = splat_types(scalar), splat_functions(scalar)
+    View, vector, footprint_type = types.View, types.vector, types.footprint
+
+    @wp.kernel(module=module)
     def count_splats(
         view: View,
         particle_count: int,
@@ -341,12 +343,12 @@ def splat_kernels(scalar: type, lanes: int) -> SimpleNamespace:
         wait_for_previous_kernel()
         i = wp.tid()
         world = i / particle_count
-        position = position_in_world(view, positions[i], means, goal, world)
+        position = splat.position_in_world(view, positions[i], means, goal, world)
         index = world * view.cell_count + splat.cell_of_centre(view, splat.patch_centre(position))
         cell[i] = index
         arrival[i] = wp.atomic_add(counts, index + 1, 1)
 
-    @wp.kernel(enable_backward=False, module=module)
+    @wp.kernel(module=module)
     def place_splats(
         cell: wp.array[wp.int32],
         arrival: wp.array[wp.int32],
@@ -359,7 +361,7 @@ def splat_kernels(scalar: type, lanes: int) -> SimpleNamespace:
         i = wp.tid()
         arrived[starts[cell[i]] + arrival[i]] = i
 
-    @wp.kernel(enable_backward=False, module=module)
+    @wp.kernel(module=module)
     def order_splats(
         view: View,
         particle_count: int,
@@ -381,7 +383,7 @@ def splat_kernels(scalar: type, lanes: int) -> SimpleNamespace:
         i = arrived[k]
         c = cell[i]
         world = i / particle_count
-        position = position_in_world(view, positions[i], means, goal, world)
+        position = splat.position_in_world(view, positions[i], means, goal, world)
         footprint = splat.footprint_of(view, position, i, states, shift)
         begin = starts[c]
         target = k
@@ -393,6 +395,16 @@ def splat_kernels(scalar: type, lanes: int) -> SimpleNamespace:
                     target += 1
         wide_store(footprints, target, footprint)
         original_index[target] = i
+
+    return namespace(locals())
+
+
+def gathering_kernel(scalar: type, lanes: int, module: wp.Module) -> wp.Kernel:
+    """Return the kernel that draws by tiles of pixels, for CUDA."""
+    types, gather_tile = splat_types(scalar), gather_functions(scalar, lanes).gather_tile
+    View, colour_type = types.View, types.colour
+    group_tiles = GROUP_WIDTH * GROUP_HEIGHT
+    lane_pixels = TILE_WIDTH * TILE_HEIGHT // lanes
 
     @wp.func
     def tile_of(view: View, t: int):
@@ -418,11 +430,11 @@ def splat_kernels(scalar: type, lanes: int) -> SimpleNamespace:
             pixel = wp.int32(-1)
         return pixel
 
-    @wp.kernel(enable_backward=False, module=module, cuda_max_registers=gather_registers(scalar))
+    @wp.kernel(module=module, cuda_max_registers=gather_registers(scalar))
     def gather_splats(
         view: View,
         starts: wp.array[wp.int32],
-        footprints: wp.array[footprint_type],
+        footprints: wp.array[types.footprint],
         # outputs
         picture: wp.array[colour_type],
     ):
@@ -437,11 +449,19 @@ def splat_kernels(scalar: type, lanes: int) -> SimpleNamespace:
                     value = colour_type(values[0, k], values[1, k], values[2, k], values[3, k])
                     wide_store(picture, begin + pixel, value)
 
+    return gather_splats
+
+
+def scattering_kernel(scalar: type, module: wp.Module) -> wp.Kernel:
+    """Return the kernel that draws by particles, for CPUs."""
+    types, splat = splat_types(scalar), splat_functions(scalar)
+    vector = types.vector
+
     @in_ranges(WORLDS)
-    @wp.kernel(enable_backward=False, module=module)
+    @wp.kernel(module=module)
     def scatter_splats(
         range_start: int,
-        view: View,
+        view: types.View,
         particle_count: int,
         positions: wp.array[vector],
         states: wp.array2d[scalar],
@@ -450,15 +470,15 @@ def splat_kernels(scalar: type, lanes: int) -> SimpleNamespace:
         goal: wp.array[vector],
         scratch: wp.array2d[scalar],
         # added to
-        picture: wp.array3d[colour_type],
+        picture: wp.array3d[types.colour],
         # outputs
-        footprints: wp.array[footprint_type],
+        footprints: wp.array[types.footprint],
         original_index: wp.array[wp.int32],
     ):
         """Draw the picture of a world, particle after particle; for devices with few threads."""
         world = range_start + wp.tid()
         for i in range(world * particle_count, (world + 1) * particle_count):
-            position = position_in_world(view, positions[i], means, goal, world)
+            position = splat.position_in_world(view, positions[i], means, goal, world)
             footprint = splat.footprint_of(view, position, i, states, shift)
             footprints[i] = footprint
             original_index[i] = i
@@ -480,13 +500,23 @@ def splat_kernels(scalar: type, lanes: int) -> SimpleNamespace:
                         drawn = picture[world, p, q]
                         picture[world, p, q] = drawn + scratch[world, q - left] * along
 
+    return scatter_splats
+
+
+def adjoint_kernel(scalar: type, lanes: int, module: wp.Module) -> wp.Kernel:
+    """Return the kernel of the cotangents of particles' positions and colours."""
+    types, splat = splat_types(scalar), splat_functions(scalar)
+    vector, colour_type, bar_type = types.vector, types.colour, types.splat_bar
+    load_footprint, load_colour = make_wide_load(types.footprint), make_wide_load(colour_type)
+    lane_sum = make_lane_sum(bar_type, lanes)
+
     @in_ranges(PAIRS)
-    @wp.kernel(enable_backward=False, module=module)
+    @wp.kernel(module=module)
     def pull_back_splats(
         range_start: int,
-        view: View,
+        view: types.View,
         particle_count: int,
-        footprints: wp.array[footprint_type],
+        footprints: wp.array[types.footprint],
         original_index: wp.array[wp.int32],
         picture_bar: wp.array[colour_type],
         # outputs
@@ -551,4 +581,4 @@ def splat_kernels(scalar: type, lanes: int) -> SimpleNamespace:
             for c in range(3):
                 colours_bar[i, c] = colour_bar[c]
 
-    return namespace(locals())
+    return pull_back_splats

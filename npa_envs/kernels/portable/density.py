@@ -21,8 +21,7 @@ def density_kernels(space_dim: int, scalar: type, on_cpu: bool) -> SimpleNamespa
     """Return the kernels of densities and neighbour lists, with one thread per particle."""
     space = domain_types(space_dim, scalar)
     vector, particle, Domain = space.vector, space.particle, space.Domain
-    vector_f64 = wp.types.vector(space_dim, wp.float64)
-    search = make_search(space_dim, scalar, particle, on_cpu)
+    vector_f64, search = space.vector_f64, make_search(space_dim, scalar, particle, on_cpu)
     module = kernel_module("density", space_dim, scalar, on_cpu=on_cpu)
 
     @wp.func
@@ -40,7 +39,7 @@ def density_kernels(space_dim: int, scalar: type, on_cpu: bool) -> SimpleNamespa
         return kernel
 
     @in_ranges(PAIRS)
-    @wp.kernel(enable_backward=False, module=module)
+    @wp.kernel(module=module)
     def compute_density(
         range_start: int,
         domain: Domain,
@@ -99,7 +98,7 @@ def density_kernels(space_dim: int, scalar: type, on_cpu: bool) -> SimpleNamespa
             density_gradients[k] = gradient
 
     @in_ranges(PAIRS)
-    @wp.kernel(enable_backward=False, module=module)
+    @wp.kernel(module=module)
     def list_neighbours(
         range_start: int,
         domain: Domain,
@@ -146,14 +145,13 @@ def species_kernel(space_dim: int, scalar: type, species_count: int) -> wp.Kerne
     gradients cancel almost fully where particles are dense.
     """
     space = domain_types(space_dim, scalar)
-    vector, Domain = space.vector, space.Domain
-    vector_f64 = wp.types.vector(space_dim, wp.float64)
+    vector, vector_f64, Domain = space.vector, space.vector_f64, space.Domain
     densities_type = wp.types.vector(species_count, wp.float64)
     gradients_type = wp.types.matrix((species_count, space_dim), wp.float64)
     module = kernel_module("species", space_dim, scalar, species=species_count)
 
     @in_ranges(PAIRS)
-    @wp.kernel(enable_backward=False, module=module)
+    @wp.kernel(module=module)
     def gather_species(
         range_start: int,
         domain: Domain,

@@ -68,7 +68,7 @@ def world_words(
 
 @wp.func
 def joined(high: wp.uint32, low: wp.uint32):
-    """Join two words to 64 bits."""
+    """Return two words joined to 64 bits."""
     return (wp.uint64(high) << wp.uint64(32)) | wp.uint64(low)
 
 
@@ -136,8 +136,7 @@ def draw_kernel(distribution: str, value_type: type) -> tuple[wp.Kernel, int]:
         return result
 
     functions = {"uniform": uniform, "normal": normal, "bernoulli": bernoulli, "integers": integers}
-    numbers_of = functions[distribution]
-    name = f"{distribution}_{value_type.__name__}"
+    numbers_of, name = functions[distribution], f"{distribution}_{value_type.__name__}"
 
     @wp.kernel(enable_backward=False, module=wp.get_module(f"npa_envs.kernels.draws_{name}"))
     def draw(

@@ -37,7 +37,7 @@ def equivariance_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
         return a * (count - first) - a * (a - 1) / 2 + b - a - first
 
     @in_ranges(ELEMENTS)
-    @wp.kernel(enable_backward=False, module=module)
+    @wp.kernel(module=module)
     def mix_vectors(
         range_start: int,
         scalars: int,
@@ -59,7 +59,7 @@ def equivariance_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
         mixed[row, a] = total
 
     @in_ranges(ELEMENTS)
-    @wp.kernel(enable_backward=False, module=module)
+    @wp.kernel(module=module)
     def write_inputs(
         range_start: int,
         scalars: int,
@@ -97,7 +97,7 @@ def equivariance_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
                 inputs[row, column] = scalar(0.0)
 
     @in_ranges(ELEMENTS)
-    @wp.kernel(enable_backward=False, module=module)
+    @wp.kernel(module=module)
     def pull_back_products(
         range_start: int,
         scalars: int,
@@ -130,7 +130,7 @@ def equivariance_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
         whole_bar[row, a] = total
 
     @in_ranges(ELEMENTS)
-    @wp.kernel(enable_backward=False, module=module)
+    @wp.kernel(module=module)
     def pull_back_rows(
         range_start: int,
         scalars: int,
@@ -158,7 +158,7 @@ def equivariance_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
                 rows_bar[row, column] = scalar(0.0)
 
     @in_ranges(ELEMENTS)
-    @wp.kernel(enable_backward=False, module=module)
+    @wp.kernel(module=module)
     def steer(
         range_start: int,
         gate_count: int,
@@ -196,7 +196,7 @@ def equivariance_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
         update[row, column] = value
 
     @in_ranges(ELEMENTS)
-    @wp.kernel(enable_backward=False, module=module)
+    @wp.kernel(module=module)
     def pull_back_steering(
         range_start: int,
         gate_count: int,

@@ -31,7 +31,7 @@ def sort_kernels(space_dim: int, scalar: type, width: int) -> SimpleNamespace:
     read_channels = make_read_channels(group)
     module = kernel_module("sort", space_dim, scalar, width=width)
 
-    @wp.kernel(enable_backward=False, module=module)
+    @wp.kernel(module=module)
     def count_cells(
         domain: Domain,
         positions: wp.array[vector],
@@ -53,7 +53,7 @@ def sort_kernels(space_dim: int, scalar: type, width: int) -> SimpleNamespace:
         if mask.shape[0] > 0 and mask[i] != wp.uint8(0):
             wp.atomic_add(counts, active_offset + index + 1, 1)
 
-    @wp.kernel(enable_backward=False, module=module)
+    @wp.kernel(module=module)
     def place_by_arrival(
         mask: wp.array[wp.uint8],
         cell: wp.array[wp.int32],
@@ -76,7 +76,7 @@ def sort_kernels(space_dim: int, scalar: type, width: int) -> SimpleNamespace:
         wide_store(arrived, target, wp.vec2i(entry, c))
 
     @in_ranges(PARTICLES)
-    @wp.kernel(enable_backward=False, module=module)
+    @wp.kernel(module=module)
     def order_particles(
         range_start: int,
         positions: wp.array[vector],
@@ -129,7 +129,7 @@ def sort_kernels(space_dim: int, scalar: type, width: int) -> SimpleNamespace:
                 sorted_states[target * group_count + g] = state
 
     @in_ranges(WORLDS)
-    @wp.kernel(enable_backward=False, module=module)
+    @wp.kernel(module=module)
     def sort_worlds(
         range_start: int,
         domain: Domain,
@@ -230,7 +230,7 @@ def give_rows(space_dim: int, scalar: type) -> wp.Kernel:
     """Return the kernel that numbers the rows of the active particles of sorted worlds."""
     vector = wp.types.vector(space_dim, scalar)
 
-    @wp.kernel(enable_backward=False, module=kernel_module("rows", space_dim, scalar))
+    @wp.kernel(module=kernel_module("rows", space_dim, scalar))
     def give_rows(
         total: int,
         active_offset: int,

@@ -38,8 +38,8 @@ MOVED_TOGETHER = 32
 @cached_under_lock()
 def motion_functions(space_dim: int, scalar: type) -> SimpleNamespace:
     """Return the Warp functions that move a position and keep it within the boundary."""
-    vector = domain_types(space_dim, scalar).vector
-    vector_f64 = wp.types.vector(space_dim, wp.float64)
+    space = domain_types(space_dim, scalar)
+    vector, vector_f64 = space.vector, space.vector_f64
 
     @wp.func
     def displaced(position: vector, factor: wp.float64, direction: vector_f64):
@@ -68,8 +68,8 @@ def motion_functions(space_dim: int, scalar: type) -> SimpleNamespace:
 @cached_under_lock()
 def update_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
     """Return the kernel that moves particles and changes states by updates, and its adjoint."""
-    vector = domain_types(space_dim, scalar).vector
-    vector_f64 = wp.types.vector(space_dim, wp.float64)
+    space = domain_types(space_dim, scalar)
+    vector, vector_f64 = space.vector, space.vector_f64
     channels = wp.types.vector(THREAD_CHANNELS, scalar)
     motion = motion_functions(space_dim, scalar)
     load_scalar = make_wide_load(scalar)
@@ -78,7 +78,7 @@ def update_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
     module = kernel_module("update", space_dim, scalar)
 
     @in_ranges(ELEMENTS)
-    @wp.kernel(enable_backward=False, module=module)
+    @wp.kernel(module=module)
     def apply_update(
         range_start: int,
         largest_step: wp.float64,
@@ -152,7 +152,7 @@ def update_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
                     new_states[states_begin + k] = value
 
     @in_ranges(ELEMENTS)
-    @wp.kernel(enable_backward=False, module=module)
+    @wp.kernel(module=module)
     def pull_back_update(
         range_start: int,
         largest_step: scalar,
@@ -218,8 +218,8 @@ def update_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
 @cached_under_lock()
 def action_kernel(space_dim: int, scalar: type) -> wp.Kernel:
     """Return the kernel that moves particles and changes states by actions."""
-    vector = domain_types(space_dim, scalar).vector
-    vector_f64 = wp.types.vector(space_dim, wp.float64)
+    space = domain_types(space_dim, scalar)
+    vector, vector_f64 = space.vector, space.vector_f64
     channels = wp.types.vector(THREAD_CHANNELS, scalar)
     motion = motion_functions(space_dim, scalar)
     read_states = make_read_at(channels, 16)
@@ -263,7 +263,7 @@ def action_kernel(space_dim: int, scalar: type) -> wp.Kernel:
         return motion.displaced(position, step, action)
 
     @in_ranges(ELEMENTS)
-    @wp.kernel(enable_backward=False, module=kernel_module("actions", space_dim, scalar))
+    @wp.kernel(module=kernel_module("actions", space_dim, scalar))
     def apply_actions(
         range_start: int,
         particle_count: int,
@@ -384,7 +384,7 @@ def flag_not_finite(scalar: type) -> wp.Kernel:
     module = native.module(f"npa_envs.kernels.finite_{scalar_name(scalar)}")
     read_quad = make_read_at(wp.types.vector(QUAD, scalar), 16)
 
-    @wp.kernel(enable_backward=False, module=module)
+    @wp.kernel(module=module)
     def flag_not_finite(
         thread_count: int,
         values: wp.array[scalar],
