@@ -124,7 +124,7 @@ def log_scale_tangential(length: Any):
 
 @wp.func
 def log_scale_adjoint(scaled: Any, cotangent: Any):
-    """Loss gradient by v, from `cotangent`, that by L(v) of `log_scaled`, and `scaled` = L(v)."""
+    """Loss gradient by v from `cotangent`, the loss gradient by L(v), and from `scaled` = L(v)."""
     length = wp.length(scaled)
     tangential = log_scale_tangential(length)
     result = tangential * cotangent
@@ -147,7 +147,7 @@ def perception_module_name(state_gradient: bool, moment_inverse: str | None) -> 
 def make_corrected(space_dim: int, scalar: type, width: int, moment_inverse: str | None) -> Any:
     """Return a Warp function that multiplies state gradients [D, width] by an inverse of moments M.
 
-    The inverse is "smooth", or "threshold", which leaves gradients unchanged where M is singular.
+    The inverse is "smooth", or "threshold", which leaves gradients as they are where M is singular.
     """
     square = wp.types.matrix((space_dim, space_dim), scalar)
     gradient_type = wp.types.matrix((space_dim, width), scalar)

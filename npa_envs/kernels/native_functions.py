@@ -35,7 +35,7 @@ CUDA_ONLY = (
 
 @cached_under_lock()
 def build_options() -> wp.ModuleBuildOptions:
-    """Return Warp's options that put the text of the C++ files into a module, and into its hash."""
+    """Return Warp's module options that put the C++ files' text into the code and its hash."""
     for_cpu = "".join(map(_text_of, BOTH_DEVICES))
     for_cuda = for_cpu + "".join(map(_text_of, CUDA_ONLY))
     return wp.ModuleBuildOptions(extra_cpu_preamble=for_cpu, extra_cuda_preamble=for_cuda)
@@ -65,8 +65,8 @@ def function(
     """Return a Warp function that calls `npa::name`, a C++ function of the `.cuh` files.
 
     `parameters` are the template parameters that C++ cannot deduce: numbers, booleans, types, names
-    of constants in `npa`. `arguments` are the types of arguments by name. `untyped`: names,
-    separated by spaces, of arguments of any type; a function with a result (`returns`) has none.
+    of constants in `npa`. `arguments` are types by name. `untyped` has the names, separated by
+    spaces, of arguments of any type; a function with a result, of type `returns`, has none.
     """
     arguments = dict.fromkeys(untyped.split(), Any) | arguments
     template = f"<{', '.join(map(_in_cpp, parameters))}>" if parameters else ""

@@ -57,7 +57,7 @@ wide_store = native.function("wide_store", untyped="entries index value")
 
 
 def scalar_of(value_type: Any) -> Any:
-    """Return the scalar type of a vector's or a matrix's entries; a scalar type itself."""
+    """Return the type of a vector's or a matrix's entries; a scalar type itself."""
     return getattr(value_type, "_wp_scalar_type_", value_type)
 
 
@@ -75,7 +75,7 @@ def make_read_at(value_type: type, alignment: int) -> Any:
 
 @cached_under_lock()
 def make_read_channels(value_type: Any) -> Any:
-    """Return a Warp function that reads adjacent channels of a particle, 0 beyond the last one."""
+    """Return a Warp function that reads adjacent channels of a particle; 0 beyond the last one."""
     scalar, count = scalar_of(value_type), value_type._length_
     read_at = make_read_at(value_type, min(wp.types.type_size_in_bytes(value_type), 16))
 
@@ -102,10 +102,10 @@ write_at = native.function("write_at", untyped="values index value")
 
 @cached_under_lock()
 def make_lane_sum(value_type: type, lanes: int, whole_warps: bool = False, stride: int = 1) -> Any:
-    """Return a Warp function that sums a value over the threads of a particle; each gets the sum.
+    """Return a Warp function that adds a value over the threads of a particle; each gets the sum.
 
     On a CPU there is one thread. With `whole_warps` all threads of a warp must call it together,
-    which takes fewer instructions. Every `stride`-th thread is summed, a power of two.
+    which takes fewer instructions. Every `stride`-th thread is added, a power of two.
     """
     options = scalar_of(value_type), lanes, whole_warps, stride
     return native.function("lane_sum", *options, value=value_type, returns=value_type)

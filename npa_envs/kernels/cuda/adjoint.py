@@ -66,7 +66,7 @@ row_list_address = native.function(
 
 @cached_under_lock()
 def make_read_columns(count: int) -> Any:
-    """Return a Warp function that reads `count` adjacent numbers of a row, 0 from `end` on."""
+    """Return a Warp function that reads `count` adjacent columns of a row; 0 from `end` on."""
     place = {"values": wp.array2d[wp.float32], "row": int, "column": int, "end": int}
     result_type = wp.types.vector(count, wp.float32)
     return native.function("read_columns", count, **place, returns=result_type)
@@ -99,14 +99,14 @@ smallest_in_tile = native.function("smallest_in_tile", value=float, returns=floa
 
 
 def row_search(space_dim: int, periodic: bool) -> SimpleNamespace:
-    """Return the functions that list the runs of cells around 8 particles and test their rows."""
+    """Return the functions that find rows near 8 particles: by runs of cells, then by distance."""
     scalar = wp.float32
     space = domain_types(space_dim, scalar)
     vector, cell_vector, Domain = space.vector, space.cell_vector, space.Domain
 
     @wp.func
     def line_of(domain: Domain, cell: cell_vector):
-        """Return the index of the line of cells along the first axis that contains a cell."""
+        """Return the index of the line of cells, along the first axis, that contains a cell."""
         line = cell[1]
         if wp.static(space_dim == 3):
             line += cell[wp.static(space_dim - 1)] * domain.cell_shape[1]
@@ -116,8 +116,8 @@ def row_search(space_dim: int, periodic: bool) -> SimpleNamespace:
     def run_cells(domain: Domain, line: int, begin: int, end: int, run: int):
         """Return the first and last + 1 cell (row-major index) of run number `run` around `line`.
 
-        A line is a row of cells along x. Of each line within eps of `line` the columns `begin` to
-        before `end` are one run of adjacent cells, or two if they wrap around the grid.
+        A line is a row of cells along x. Columns `begin` to before `end` of each line within eps of
+        `line` are one run of adjacent cells, or two runs if they wrap around the grid.
         """
         nx = domain.cell_shape[0]
         first = begin
@@ -155,7 +155,7 @@ def row_search(space_dim: int, periodic: bool) -> SimpleNamespace:
 
     @wp.func
     def count_runs(domain: Domain, to_column: int):
-        """Return how many runs `run_cells` has around a line, for columns up to `to_column`."""
+        """Return the number of runs that `run_cells` has around a line, up to `to_column`."""
         runs = space.cells_around(domain, 1)
         if wp.static(space_dim == 3):
             runs *= space.cells_around(domain, wp.static(space_dim - 1))
@@ -163,7 +163,7 @@ def row_search(space_dim: int, periodic: bool) -> SimpleNamespace:
 
     @wp.func
     def box_around(domain: Domain, position: vector, origin: vector, served: bool):
-        """Return centre (from `origin`) and half sides of a box around `served` particles."""
+        """Return centre (from `origin`) and half sides of the box around `served` particles."""
         relative = position - origin
         if wp.static(periodic):
             relative = space.periodic_image(domain, relative)
@@ -178,7 +178,7 @@ def row_search(space_dim: int, periodic: bool) -> SimpleNamespace:
 
     @wp.func
     def near_box(domain: Domain, offset: vector, half: vector):
-        """Return whether a point is within eps of a box, of half sides `half`, by its offset."""
+        """Return whether a point is within eps of a box; `offset`: from its centre."""
         nearest = offset
         if wp.static(periodic):
             nearest = space.periodic_image(domain, nearest)
@@ -190,7 +190,7 @@ def row_search(space_dim: int, periodic: bool) -> SimpleNamespace:
 
     @wp.func
     def row_entry(position: vector, number: int):
-        """Return a list entry of a row: its particle's position, the index of its cotangents."""
+        """Return a row's list entry: its particle's position, and `number`, its first index."""
         entry = ENTRY()
         for d in range(wp.static(space_dim)):
             entry[d] = position[d]
@@ -219,11 +219,11 @@ def row_search(space_dim: int, periodic: bool) -> SimpleNamespace:
 def listed_adjoint(
     space_dim: int, width: int, state_gradient: bool, periodic: bool, grouped: bool
 ) -> SimpleNamespace:
-    """Return the kernels that compute cotangents of states from those of perception.
+    """Return the backward kernels of perception that compute dL/d(states), by name.
 
-    `periodic`: in a box, else in open space. `grouped`: with several groups of `width` channels.
-    The cotangents of a row and group are contiguous, [1 + D, width]: of the smoothed state, then of
-    the state gradient. Zeros follow those of the last row.
+    They are for a box if `periodic`, else for open space, and for several groups of `width`
+    channels if `grouped`. The gradients by perception of a row and group are contiguous, [1 + D,
+    width]: of the smoothed state, then of the state gradient. Zeros follow those of the last row.
     """
     scalar = wp.float32
     space = domain_types(space_dim, scalar)
@@ -259,7 +259,7 @@ def listed_adjoint(
         # outputs
         cotangents: wp.array[CHANNELS],
     ):
-        """Write dL/d(smoothed states) times `smoothed_scale`, dL/d(gradients before scaling)."""
+        """Write dL/d(smoothed states) times `smoothed_scale`, and dL/d(state gradients)."""
         wait_for_previous_kernel()
         allow_next_launch()
         thread = wp.tid()
@@ -317,7 +317,7 @@ def listed_adjoint(
         # outputs
         states_bar: wp.array2d[scalar],
     ):
-        """Write the cotangent of each particle's state, summed over the active particles around it.
+        """Write dL/d(state) of each particle, a sum over the active particles around it.
 
         A world's particles are `tile_count` tiles of 8; a warp serves a tile and a group of
         channels. `norm` is the normalising constant of the kernels, which multiplies the sum.

@@ -69,8 +69,8 @@ def listed_density(
 ) -> wp.Kernel:
     """Return the kernel that computes densities and lists neighbours, `lanes` threads per particle.
 
-    `capacity`: longest list. `masked`: only active particles get lists. With several lanes,
-    launches have complete warps, whose threads write lists together.
+    `capacity` is the maximum length of a list. If `masked`, only active particles get lists. With
+    several lanes, launches have complete warps, whose threads write lists together.
     """
     scalar = wp.float32
     flat = space_dim == 2
@@ -108,10 +108,10 @@ def listed_density(
 
     @wp.func
     def cells_beyond(within_cell: vector, line: int):
-        """Return how many cells at the beginning, and at the end, of a line of five are beyond eps.
+        """Return the numbers of cells beyond eps at the beginning and at the end of a line of five.
 
-        The five lines around a particle are numbered from 0; its own is 2. `within_cell` is its
-        position in its cell, in units of a cell.
+        The five lines around a particle have numbers 0 to 4; the particle is in line 2.
+        `within_cell` is its position in its cell, in units of a cell.
         """
         across = wp.where(
             line < 2, within_cell[1] + scalar(1 - line), scalar(line - 2) - within_cell[1]
@@ -140,10 +140,10 @@ def listed_density(
         lists: wp.array3d[wp.int16],
         list_lengths: wp.array[wp.int32],
     ):
-        """Write positions with volumes 1 / rho, and neighbour lists of active particles.
+        """Write each particle's position and volume 1 / ρ, and neighbour lists of active ones.
 
-        They go to `records`, in 2D with the index of the particle's state, and to `particles`
-        unless it is empty. Of a list longer than the capacity only the length is written.
+        Positions and volumes go to `records`, in 2D with the index of the particle's state, and to
+        `particles` unless it is empty. Of a list beyond the capacity only the length is written.
         """
         wait_for_previous_kernel()
         thread = wp.tid()
@@ -247,7 +247,7 @@ def listed_density(
 def tiled_density(periodic: bool, capacity: int, masked: bool) -> wp.Kernel:
     """Return the kernel that computes densities and lists neighbours in 2D, a warp for 8 particles.
 
-    `capacity`: longest list. `masked`: only active particles get lists.
+    `capacity` is the maximum length of a list. If `masked`, only active particles get lists.
     """
     space = domain_types(2, wp.float32)
     vector, particle, Domain = space.vector, space.particle, space.Domain
@@ -278,7 +278,7 @@ def tiled_density(periodic: bool, capacity: int, masked: bool) -> wp.Kernel:
         lists: wp.array3d[wp.int16],
         list_lengths: wp.array[wp.int32],
     ):
-        """Write what the kernel of `listed_density` writes, but lists one after the other."""
+        """Write what the kernel of `listed_density` writes; each list is contiguous."""
         wait_for_previous_kernel()
         thread = thread_number()
         tile = thread >> wp.static(WARP.bit_length() - 1)

@@ -122,7 +122,7 @@ class PerceptionVariant(NamedTuple):
 
 
 def thread_types(variant: PerceptionVariant) -> SimpleNamespace:
-    """Return `group_types` of a thread's channels, with the structs of a thread and of its sums."""
+    """Return `group_types` of the channels that a lane sums, and the structs `Lane` and `Sums`."""
     space = group_types(variant.space_dim, wp.float32, variant.lane_width)
 
     @wp.struct
@@ -281,7 +281,7 @@ def weighing_functions(variant: PerceptionVariant, space: SimpleNamespace) -> Si
         own: Lane,
         sums: Sums,
     ):
-        """Weigh the neighbours whose indices are entries `begin` to `count` - 1 of the scratch."""
+        """Return `sums` plus terms of the neighbours in scratch entries `begin` to `count` - 1."""
         sync_warp()
         for first in range(own.lane, space.padded(count), wp.static(PAIR * lanes)):
             indices = indices_of_pair()
@@ -314,10 +314,10 @@ def weighing_functions(variant: PerceptionVariant, space: SimpleNamespace) -> Si
         pair: int,
         sums: Sums,
     ):
-        """Weigh up to `SCRATCH_ENTRIES` entries of a neighbour list, from `begin` on.
+        """Write weights of up to `SCRATCH_ENTRIES` neighbours of a list, from number `begin` on.
 
-        Return the lane's next two entries, packed, and the sums. `pair` has the first two entries:
-        they are loaded before the previous ones are used.
+        Return the next `pair`, and `sums` plus their terms. `pair` has the next two list entries of
+        the lane, which are loaded before the previous ones are used.
         """
         end = begin + space.padded(wp.clamp(length - begin, 0, wp.static(SCRATCH_ENTRIES)))
         for first in range(begin + wp.static(PAIR) * own.lane, end, wp.static(PAIR * lanes)):
@@ -352,7 +352,7 @@ def make_add_states(variant: PerceptionVariant, space: SimpleNamespace) -> wp.Fu
 
     @wp.func
     def add_states(own: Lane, count: int, sums: Sums):
-        """Return `sums` plus the team's part of the weighted states of `count` scratch entries."""
+        """Return `sums` plus weighted states of the team's part of `count` scratch entries."""
         for entry in range(own.first, space.padded(count), wp.static(teams * TOGETHER)):
             packed = entries_together()
             loaded = states_together()
@@ -444,7 +444,7 @@ def make_add_searched(
         own: Lane,
         sums: Sums,
     ):
-        """Return `sums` plus the neighbours of particles that are `searching`; for whole warps."""
+        """Return `sums` plus neighbours' terms of `searching` particles; whole warps call it."""
         world_cell = wp.int32(0)
         cell = cell_vector()
         particle_runs = wp.int32(0)

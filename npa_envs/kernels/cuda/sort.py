@@ -1,9 +1,8 @@
 """Cell lists of small worlds on CUDA, also of splats: a block sorts a world in shared memory.
 
-The same order as in the portable kernels, in one launch instead of six: particles are counted by
+The order is that of the portable kernels, in one launch instead of six: particles are counted by
 cell, the counts are added up, particles get provisional positions in order of arrival, and ranks
-among indices replace these. If worlds are few, several blocks sort the same world, and each writes
-a slice.
+among indices replace these. Several blocks share a world if worlds are few: each writes a slice.
 """
 
 from types import SimpleNamespace
@@ -50,11 +49,11 @@ count_active = native.function("count_active", mask=wp.array[wp.uint8], count=in
 
 @cached_under_lock()
 def block_functions(capacity: int) -> SimpleNamespace:
-    """Return the functions by which a block sorts a world of up to `capacity` particles."""
+    """Return the C++ functions with which a block sorts a world of up to `capacity` particles."""
     sizes = capacity, BLOCKS[capacity], MAX_GRID
 
     def of_block(name: str, returns: Any = None, **arguments: Any) -> Any:
-        """Return the C++ function `name` for Warp; it takes the block's `block_memory` first."""
+        """Return a Warp function for the C++ function `name` of a `block_memory`."""
         return native.function(name, *sizes, address=wp.uint64, **arguments, returns=returns)
 
     return SimpleNamespace(
@@ -72,7 +71,7 @@ def block_functions(capacity: int) -> SimpleNamespace:
 
 @cached_under_lock()
 def sort_small_worlds(space_dim: int, capacity: int) -> wp.Kernel:
-    """Return the kernel that sorts worlds of up to `capacity` particles in float32, by blocks."""
+    """Return the kernel that sorts float32 worlds of up to `capacity` particles, by blocks."""
     scalar = wp.float32
     block = BLOCKS[capacity]
     rounds = capacity // block
@@ -111,7 +110,7 @@ def sort_small_worlds(space_dim: int, capacity: int) -> wp.Kernel:
         row_positions: wp.array[vector],
         sorted_states: wp.array[channels],
     ):
-        """Sort a world by cell, then index: each of its blocks sorts all of it, writes a slice."""
+        """Sort a world by cell, then index: each of its blocks sorts it and writes a slice."""
         wait_for_previous_kernel()
         world = block_number() / slice_count
         slice_number = block_number() - world * slice_count
@@ -198,10 +197,9 @@ def sort_small_worlds(space_dim: int, capacity: int) -> wp.Kernel:
 
 @cached_under_lock()
 def sort_small_splats(capacity: int) -> wp.Kernel:
-    """Return the kernel that sorts particles' footprints on pictures, for small worlds.
+    """Return the kernel that sorts the footprints of small worlds' particles on pictures.
 
-    They are the same, in the same order, as in `pictures/splat.py`. A block also computes the mean
-    position of its world.
+    Footprints and order are those of `pictures/splat.py`. A block also computes its world's mean.
     """
     scalar = wp.float32
     block = BLOCKS[capacity]
@@ -281,7 +279,7 @@ def sort_small_splats(capacity: int) -> wp.Kernel:
 
 @cached_under_lock()
 def order_particles(space_dim: int, width: int) -> wp.Kernel:
-    """Return the last kernel of sorting large worlds; a warp moves the states of 32 particles."""
+    """Return the last kernel that sorts large worlds; a warp moves states of 32 particles."""
     scalar = wp.float32
     vector = domain_types(space_dim, scalar).vector
     thread_width = width // CUDA_LANES

@@ -40,7 +40,7 @@ ROUND_TILES = WARP_TILES * BLOCK_WARPS
 
 @cached_under_lock()
 def make_pixel_errors(scalar: type) -> wp.Function:
-    """Return a Warp function of a pixel's density error and colour error.
+    """Return a Warp function for the density error and the colour error of a pixel.
 
     The density error is |d| + d² of the difference d in density; the colour error is the sum of the
     same over red, green and blue, times exp(-density error).
@@ -64,7 +64,7 @@ def make_pixel_errors(scalar: type) -> wp.Function:
 
 @cached_under_lock()
 def gather_errors(scalar: type) -> wp.Kernel:
-    """Return the kernel that sums particles at pixels and compares with a target; for CUDA."""
+    """Return the kernel that draws pictures by tiles and compares them with a target, for CUDA."""
     types = splat_types(scalar)
     View, colour_type, footprint_type = types.View, types.colour, types.footprint
     row_type = wp.types.matrix((CHANNELS, TILE_WIDTH), scalar)

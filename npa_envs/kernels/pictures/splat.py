@@ -119,7 +119,7 @@ def make_view(
 
 
 def gather_registers(scalar: type) -> int | None:
-    """Return the most registers of a CUDA thread that gathers splats; None: no limit."""
+    """Return the maximum number of registers per thread of `gather_splats`; None: no limit."""
     return CUDA_REGISTERS if scalar == wp.float32 else None
 
 
@@ -309,7 +309,7 @@ def gather_functions(scalar: type, lanes: int) -> SimpleNamespace:
 
 @cached_under_lock()
 def splat_kernels(scalar: type, lanes: int) -> SimpleNamespace:
-    """Return the kernels that draw worlds, and the adjoint; `lanes` threads a tile or particle."""
+    """Return the kernels that draw worlds and pull back; `lanes` threads per tile or particle."""
     module = native.module(f"npa_envs.kernels.splat_{scalar_name(scalar)}_l{lanes}")
     return SimpleNamespace(
         **vars(sorting_kernels(scalar, module)),
@@ -408,7 +408,7 @@ def gathering_kernel(scalar: type, lanes: int, module: wp.Module) -> wp.Kernel:
 
     @wp.func
     def tile_of(view: View, t: int):
-        """Return world, row and column of thread t's tile, and the thread's number in it."""
+        """Return world, row and column of thread t's tile, and the thread's number in the tile."""
         across = (view.tile_columns + wp.static(GROUP_WIDTH - 1)) / wp.static(GROUP_WIDTH)
         down = (view.tile_rows + wp.static(GROUP_HEIGHT - 1)) / wp.static(GROUP_HEIGHT)
         tile = t / wp.static(lanes)
@@ -475,7 +475,7 @@ def scattering_kernel(scalar: type, module: wp.Module) -> wp.Kernel:
         footprints: wp.array[types.footprint],
         original_index: wp.array[wp.int32],
     ):
-        """Draw the picture of a world, particle after particle; for devices with few threads."""
+        """Draw a world's picture, particle after particle; for devices with few threads."""
         world = range_start + wp.tid()
         for i in range(world * particle_count, (world + 1) * particle_count):
             position = splat.position_in_world(view, positions[i], means, goal, world)
@@ -504,7 +504,7 @@ def scattering_kernel(scalar: type, module: wp.Module) -> wp.Kernel:
 
 
 def adjoint_kernel(scalar: type, lanes: int, module: wp.Module) -> wp.Kernel:
-    """Return the kernel of the cotangents of particles' positions and colours."""
+    """Return the backward kernel: loss gradients by particles' positions and colours."""
     types, splat = splat_types(scalar), splat_functions(scalar)
     vector, colour_type, bar_type = types.vector, types.colour, types.splat_bar
     load_footprint, load_colour = make_wide_load(types.footprint), make_wide_load(colour_type)
@@ -523,7 +523,7 @@ def adjoint_kernel(scalar: type, lanes: int, module: wp.Module) -> wp.Kernel:
         positions_bar: wp.array[vector],
         colours_bar: wp.array2d[scalar],
     ):
-        """Write the cotangents of particles' positions and colours from those of the pixels."""
+        """Write loss gradients by particles' positions and colours, from those by pixels."""
         k, lane = wp.tid()
         k += range_start
         world = k / particle_count

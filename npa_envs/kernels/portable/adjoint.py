@@ -56,14 +56,14 @@ def adjoint_kernels(
 
 
 def unscaling_kernel(space: SimpleNamespace, module: wp.Module, state_gradient: bool) -> wp.Kernel:
-    """Return the kernel that pulls `perception_bar` back through the logarithmic scaling."""
+    """Return the kernel that pulls gradients back through the logarithmic scaling."""
     space_dim, scalar, width, vector = space.space_dim, space.scalar, space.width, space.vector
 
     @wp.func
     def unscaled(
         perception: wp.array2d[scalar], perception_bar: wp.array2d[scalar], row: int, column: int
     ):
-        """Return the cotangent before the logarithmic scaling of the vector from `column` on."""
+        """Return the loss gradient by the vector whose logarithmic scaling begins at `column`."""
         scaled = vector()
         bar = vector()
         for d in range(wp.static(space_dim)):
@@ -89,7 +89,7 @@ def unscaling_kernel(space: SimpleNamespace, module: wp.Module, state_gradient: 
         gradient_bar: wp.array[scalar],
         density_gradient_bar: wp.array[vector],
     ):
-        """Write dL/d(smoothed states) and dL/d(gradients before scaling), from `perception_bar`."""
+        """Write dL/d(smoothed states), dL/d(state gradients) and dL/d(density gradients)."""
         row, channel = wp.tid()
         row += range_start
         if row >= starts[starts.shape[0] - 1] - row_base:
@@ -121,7 +121,7 @@ def unscaling_kernel(space: SimpleNamespace, module: wp.Module, state_gradient: 
 def state_kernel(
     space: SimpleNamespace, module: wp.Module, state_gradient: bool, search: Any, listed: bool
 ) -> wp.Kernel:
-    """Return the kernel of cotangents of states, which finds rows by `search`."""
+    """Return the kernel of dL/d(states), which finds rows by `search`."""
     space_dim, scalar, width, vector = space.space_dim, space.scalar, space.width, space.vector
     group, indices = space.group, wp.types.vector(search.stride, wp.int32)
     add_scaled = make_add_scaled(group)
@@ -137,7 +137,7 @@ def state_kernel(
         first: int,
         end: int,
     ):
-        """Return the rows within eps in a candidate block, from `first` on, and their count."""
+        """Return the rows within eps among a block of candidates from `first`, and their count."""
         near = indices()
         count = wp.int32(0)
         if wp.static(listed):
@@ -177,9 +177,9 @@ def state_kernel(
         # outputs
         states_bar: wp.array2d[scalar],
     ):
-        """Write the cotangent of each particle's state, summed over the active particles around it.
+        """Write dL/d(state) of each particle, a sum over the active particles around it.
 
-        `flat_gradient_bar`: `gradient_bar` by number. With lists all arrays are in sorted order.
+        `flat_gradient_bar`: `gradient_bar` as scalars. With lists all arrays are in sorted order.
         """
         k, g = wp.tid()
         k += range_start
@@ -231,7 +231,7 @@ def state_kernel(
 
 
 def density_kernel(space: SimpleNamespace, module: wp.Module, state_gradient: bool) -> wp.Kernel:
-    """Return the kernel of cotangents of densities."""
+    """Return the kernel of dL/d(densities)."""
     space_dim, scalar = space.space_dim, space.scalar
 
     @in_ranges(PAIRS)
@@ -283,7 +283,7 @@ def density_kernel(space: SimpleNamespace, module: wp.Module, state_gradient: bo
 
 
 def position_kernel(space: SimpleNamespace, module: wp.Module) -> wp.Kernel:
-    """Return the kernel of cotangents of positions."""
+    """Return the kernel of dL/dx."""
     space_dim, scalar, vector = space.space_dim, space.scalar, space.vector
 
     @wp.func
@@ -294,7 +294,7 @@ def position_kernel(space: SimpleNamespace, module: wp.Module) -> wp.Kernel:
         smoothing_bar: scalar,
         kernel_bar: vector,
     ):
-        """Return the cotangent of r = neighbour - centre from the cotangents of W(r) and K(r)."""
+        """Return dL/dr of r = neighbour - centre, from dL/dW(r) and dL/dK(r)."""
         distance = wp.sqrt(squared)
         slope = smoothing_slope(squared, domain.inverse_squared_eps, domain.smoothing_norm)
         factor = spiky_factor(distance, domain.inverse_eps, domain.spiky_norm)
@@ -327,7 +327,7 @@ def position_kernel(space: SimpleNamespace, module: wp.Module) -> wp.Kernel:
         # outputs
         positions_bar: wp.array[vector],
     ):
-        """Write dL/dx of each particle, as a neighbour of others plus as a centre."""
+        """Write dL/dx of each particle: its terms as a neighbour of others, and as a centre."""
         k = range_start + wp.tid()
         entry = particles[k]
         position = space.position_of(entry)

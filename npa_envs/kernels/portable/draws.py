@@ -33,7 +33,7 @@ def high_word(a: wp.uint32, b: wp.uint32):
 
 @wp.func
 def philox(counter: words, low_key: wp.uint32, high_key: wp.uint32):
-    """Return four random words of a counter and a key, after ten rounds."""
+    """Return four random words, ten rounds of Philox, from a counter and a key."""
     c = counter
     k0 = low_key
     k1 = high_key
@@ -58,7 +58,7 @@ def world_words(
     episodes: wp.array[wp.int32],
     steps: wp.array[wp.int32],
 ):
-    """Return four random words of a world: words 4 `block` to 4 `block` + 3 of its draw `draw`."""
+    """Return four random words of a world: 4 `block` to 4 `block` + 3 of its draw `draw`."""
     key = wp.uint64(keys[world])
     counter = words(
         wp.uint32(block), wp.uint32(steps[world]), wp.uint32(draw), wp.uint32(episodes[world])
@@ -80,7 +80,7 @@ def fraction_53(high: wp.uint32, low: wp.uint32):
 
 @cached_under_lock()
 def draw_kernel(distribution: str, value_type: type) -> tuple[wp.Kernel, int]:
-    """Return the kernel of a distribution, and how many numbers a thread of it draws.
+    """Return the kernel of a distribution, and how many random numbers a thread of it writes.
 
     "uniform" numbers lie in [0, 1): 24 bits of a word in float32, 53 bits of two in float64.
     "normal" ones are pairs by the Box-Muller transform, in float64: logarithms of devices differ in
@@ -148,7 +148,7 @@ def draw_kernel(distribution: str, value_type: type) -> tuple[wp.Kernel, int]:
         # outputs
         values: wp.array2d[value_type],
     ):
-        """Write the random numbers of draw `number` in each world."""
+        """Write each world's random numbers of the draw with this `number`."""
         world, block = wp.tid()
         drawn = numbers_of(world_words(world, block, number, keys, episodes, steps), bound)
         for k in range(wp.static(count)):

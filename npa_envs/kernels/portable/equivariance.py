@@ -70,9 +70,9 @@ def equivariance_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
         # outputs
         inputs: numbers,
     ):
-        """Write the network's inputs: scalars, products of mixed vectors, the row's constant, 0.
+        """Write the network's inputs: scalars, products of mixed vectors, the constant, zeros.
 
-        `one` is the column of the constant.
+        `one` is the column of the constant 1 in `rows`.
         """
         # A thread writes the pairs that end with its vector, and some scalars: adjacent threads
         # write adjacent entries.
@@ -108,7 +108,7 @@ def equivariance_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
         # outputs
         whole_bar: vectors,
     ):
-        """Write dL/d(mixed vector): the given `mixed_bar`, plus the part through the products."""
+        """Write dL/d(mixed vectors): `mixed_bar` plus the part through the products."""
         t = range_start + wp.tid()
         count = mixed.shape[1]
         row = t / count
@@ -140,7 +140,7 @@ def equivariance_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
         # outputs
         rows_bar: numbers,
     ):
-        """Write dL/d(row) of each row of perception, 0 for the constant 1 and the padding."""
+        """Write dL/d(rows of perception), 0 for the constant 1 and the padding."""
         # A thread writes a perceived vector, and some scalars.
         t = range_start + wp.tid()
         count = mixing.shape[0]
@@ -168,7 +168,7 @@ def equivariance_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
         # outputs
         update: numbers,
     ):
-        """Write updates from a network's gates and state changes, and zeros in further columns."""
+        """Write updates: displacements, sums of mixed vectors times gates; state changes; zeros."""
         t = range_start + wp.tid()
         # Directions come first, so that adjacent threads take the same branch.
         directions = update.shape[0] * wp.static(space_dim)
@@ -208,7 +208,7 @@ def equivariance_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
         output_bar: numbers,
         mixed_bar: vectors,
     ):
-        """Write dL/d(output) and dL/d(mixed vector) from `update_bar` = dL/d(update)."""
+        """Write dL/d(output) and dL/d(mixed vectors) from `update_bar` = dL/d(update)."""
         t = range_start + wp.tid()
         width = output.shape[1]
         row = t / width

@@ -37,10 +37,10 @@ def perception_kernels(
     moment_inverse: str | None,
     listed: bool = False,
 ) -> SimpleNamespace:
-    """Return the kernels of perception vectors and fields, for groups of `width` channels.
+    """Return the kernels `perceive` and `gather_fields`, for groups of `width` channels.
 
     Without `state_gradient`, or without its correction by a `moment_inverse`, they leave out the
-    sums that only these need. `listed`: they read neighbour lists instead of cells.
+    sums that only these need. If `listed`, they read neighbour lists instead of cells.
     """
     moment_correction = moment_inverse is not None
     space = group_types(space_dim, scalar, width)

@@ -40,7 +40,7 @@ def make_search(
 
     @wp.func
     def run_count(domain: Domain, cell: cell_vector):
-        """Return the number of runs of cells around a cell; 1 for a neighbour list."""
+        """Return the number of runs of cells around a cell; with neighbour lists 1."""
         count = wp.int32(1)
         if wp.static(not listed):
             count = space.segment_count(domain, cell)

@@ -24,7 +24,7 @@ from npa_envs.thread_lock import cached_under_lock
 
 @cached_under_lock()
 def sort_kernels(space_dim: int, scalar: type, width: int) -> SimpleNamespace:
-    """Return the kernels that sort particles by cell."""
+    """Return the kernels that sort particles by cell: three in a row, or only `sort_worlds`."""
     space = domain_types(space_dim, scalar)
     vector, Domain = space.vector, space.Domain
     group = wp.types.vector(width, scalar)
@@ -246,8 +246,8 @@ def give_rows(space_dim: int, scalar: type) -> wp.Kernel:
         """Write the row of each particle, the particle of each row, and starts of cells and rows.
 
         It does so for several steps of the same sorted worlds; a step has a thread for each
-        particle or start, whichever are more. `active_before` is the cumulative number of active
-        particles over all steps, up to and with each particle.
+        particle or start, whichever are more. `active_before` is the number of active particles up
+        to and with each particle, accumulated over all steps.
         """
         wait_for_previous_kernel()
         step, t = wp.tid()

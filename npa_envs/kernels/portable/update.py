@@ -43,7 +43,7 @@ def motion_functions(space_dim: int, scalar: type) -> SimpleNamespace:
 
     @wp.func
     def displaced(position: vector, factor: wp.float64, direction: vector_f64):
-        """Return a position plus factor times direction; in float64, to round it only once."""
+        """Return position + factor * direction; in float64, to round it only once."""
         result = position
         for d in range(wp.static(space_dim)):
             result[d] = scalar(wp.float64(position[d]) + factor * direction[d])
@@ -67,7 +67,7 @@ def motion_functions(space_dim: int, scalar: type) -> SimpleNamespace:
 
 @cached_under_lock()
 def update_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
-    """Return the kernel that moves particles and changes states by updates, and its adjoint."""
+    """Return `apply_update`, which moves particles and changes states, and its backward kernel."""
     space = domain_types(space_dim, scalar)
     vector, vector_f64 = space.vector, space.vector_f64
     channels = wp.types.vector(THREAD_CHANNELS, scalar)
@@ -99,7 +99,7 @@ def update_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
         new_states: wp.array[scalar],
         new_path_length: wp.array[scalar],
     ):
-        """Write positions, states and path lengths, updated where a particle has a row."""
+        """Write new positions, states and path lengths; a particle without a row keeps its own."""
         wait_for_previous_kernel()
         # Of the threads of a group of particles, the first move one particle each, and the others
         # change some channels each.
@@ -171,7 +171,7 @@ def update_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
         # outputs
         update_bar: wp.array[scalar],
     ):
-        """Write dL/d(update) of every row, 0 beyond the last active row."""
+        """Write dL/d(update) of every row; 0 beyond the last active row."""
         wait_for_previous_kernel()
         allow_next_launch()
         # A thread writes some adjacent columns of a row.
@@ -286,7 +286,7 @@ def action_kernel(space_dim: int, scalar: type) -> wp.Kernel:
         # outputs
         diverged: wp.array[wp.uint8],
     ):
-        """Apply the actions of active particles, and mark worlds in which a value was clipped."""
+        """Apply actions of active particles in place; `diverged`: worlds with clipped values."""
         wait_for_previous_kernel()
         # All loads are issued before any value is used, as the kernel waits for memory.
         chunks = (state_dim + wp.static(THREAD_CHANNELS - 1)) / wp.static(THREAD_CHANNELS)
