@@ -1,9 +1,9 @@
 """Access to memory and to other threads' values: wide loads and stores, sums over lanes, votes.
 
-On CUDA a few adjacent threads, called lanes, may share one particle: with n lanes each sums every
-n-th candidate, and warp shuffles then add the lanes' sums in a fixed order. Short sums go to every
-lane; of long ones each lane gets some of the columns. On a CPU a particle has one lane, and the
-same source runs without shuffles.
+On CUDA a few adjacent threads of a warp, called its lanes, may share one particle: each of n lanes
+sums every n-th candidate, and warp shuffles then add the lanes' sums in a fixed order. Every lane
+gets short sums; each lane gets some columns of long sums. On a CPU a particle has one lane, and
+the same source runs without shuffles.
 
 Functions of factories and `of_warp` run on both devices. The others run on CUDA only, and all
 threads of a warp must call them together.
@@ -138,7 +138,7 @@ any_in_warp = native.function("any_in_warp", condition=bool, returns=bool)
 """Whether a condition is true for some thread of the warp."""
 
 first_in_warp = native.function("first_in_warp", condition=bool, returns=int)
-"""The first thread for which a condition is true, -1 for none."""
+"""The number in the warp of the first thread for which a condition is true, -1 for none."""
 
 vote_of_warp = native.function("vote_of_warp", condition=bool, returns=wp.uint32)
 """A number with a bit for each thread of the warp: whether a condition is true."""
@@ -150,7 +150,7 @@ sum_up_to = native.function("sum_up_to", value=int, returns=int)
 """The sum of the values of this thread and of those before it in the warp."""
 
 thread_of = native.function("thread_of", ends=int, number=int, returns=int)
-"""The first thread of the warp whose `ends` is above `number`; `ends` must ascend."""
+"""The number of the first thread of the warp whose `ends` exceeds `number`; `ends` ascend."""
 
 as_number = native.function("as_number", word=float, returns=int)
 as_word = native.function("as_word", number=int, returns=float)

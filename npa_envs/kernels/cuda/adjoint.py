@@ -1,6 +1,6 @@
-"""The adjoint of perception for states on CUDA in float32, by tiles of particles.
+"""Backward pass of perception, for states, on CUDA in float32, by tiles of particles.
 
-The same sums as the portable `gather_state_cotangents`, in another order of work. A warp serves
+The sums are those of the portable `gather_state_cotangents`, in another order. A warp serves
 eight consecutive particles of the sorted order: it lists the rows within eps of their bounding box,
 and multiplies the rows' cotangents by the weights of all eight on tensor cores. So a row's
 cotangents are read once for eight particles.
@@ -42,21 +42,21 @@ LIST_ENTRIES = 96
 """Rows of a full list; more rows are summed in several rounds."""
 
 ENTRY = wp.types.vector(4, wp.float32)
-"""A listed row: its position, and last the index of its channels."""
+"""Entry of a list, a row: the position of its particle, and last the index of its channels."""
 
-CHANNELS = wp.types.vector(4, wp.float32)
+FOUR_CHANNELS = wp.types.vector(4, wp.float32)
 """Four adjacent channels."""
 
-CUDA_REGISTERS = 64
-"""Registers per thread in the gathering of state cotangents."""
+STATE_REGISTERS = 64
+"""Registers per thread of `gather_state_cotangents`."""
 
 THREAD_CHANNELS = 4
-"""Channels of a row that one thread unscales."""
+"""Adjacent channels of a row whose gradients one thread of `unscale_cotangents` computes."""
 
 MAX_LENGTH = 3.4028234663852886e38
 """The largest float32, a bound on any coordinate [length units]."""
 
-load_channels = make_wide_load(CHANNELS)
+load_channels = make_wide_load(FOUR_CHANNELS)
 
 row_list_address = native.function(
     "row_list_address", CUDA_BLOCK // WARP, LIST_ENTRIES, returns=wp.uint32
@@ -91,7 +91,7 @@ keep_unsummed = native.function("keep_unsummed", untyped="address summed_count c
 prefetch_columns = native.function("prefetch_columns", untyped="values row column")
 """Load the memory at a row and column of a matrix into the L2 cache, for a later read."""
 
-regroup_tile = native.function("regroup_tile", total=CHANNELS, returns=CHANNELS)
+regroup_tile = native.function("regroup_tile", total=FOUR_CHANNELS, returns=FOUR_CHANNELS)
 """Exchange sums between threads: from two channels of two particles to four channels of one."""
 
 smallest_in_tile = native.function("smallest_in_tile", value=float, returns=float)
@@ -237,9 +237,9 @@ def listed_adjoint(
     parts = width // THREAD_CHANNELS
     # Of a warp's 8 particles: the sum of the listed rows' cotangents, weighted by kernels.
     rows = {"address": wp.uint32, "count": int, "domain": Domain, "position": vector}
-    values = {"channels": wp.array[scalar], "value": CHANNELS}
+    values = {"channels": wp.array[scalar], "value": FOUR_CHANNELS}
     sizes = space_dim, width, weight_count, periodic
-    sum_listed = native.function("sum_listed", *sizes, **rows, **values, returns=CHANNELS)
+    sum_listed = native.function("sum_listed", *sizes, **rows, **values, returns=FOUR_CHANNELS)
     log_scale_cotangent = native.function(
         "log_scale_cotangent", scaled=vector, cotangent=vector, returns=vector
     )
@@ -257,7 +257,7 @@ def listed_adjoint(
         perception: wp.array2d[scalar],
         perception_bar: wp.array2d[scalar],
         # outputs
-        cotangents: wp.array[CHANNELS],
+        cotangents: wp.array[FOUR_CHANNELS],
     ):
         """Write dL/d(smoothed states) times `smoothed_scale`, and dL/d(state gradients)."""
         wait_for_previous_kernel()
@@ -271,7 +271,7 @@ def listed_adjoint(
         index = entry * wp.static(weight_count * parts) + part % wp.static(parts)
         if row == row_capacity and part < wp.static(parts):
             for n in range(wp.static(weight_count)):
-                wide_store(cotangents, index + n * wp.static(parts), CHANNELS())
+                wide_store(cotangents, index + n * wp.static(parts), FOUR_CHANNELS())
         if row < wp.min(load_integer(starts, starts.shape[0] - 1) - row_base, row_capacity):
             column = state_dim + channel
             smoothed = read_channels(perception_bar, row, column, 2 * state_dim)
@@ -294,7 +294,7 @@ def listed_adjoint(
                 for d in range(wp.static(space_dim)):
                     wide_store(cotangents, index + (d + 1) * wp.static(parts), gradient_bars[d])
 
-    @wp.kernel(module=module, cuda_max_registers=CUDA_REGISTERS, grid_stride=False)
+    @wp.kernel(module=module, cuda_max_registers=STATE_REGISTERS, grid_stride=False)
     def gather_state_cotangents(
         domain: Domain,
         norm: scalar,
@@ -312,7 +312,7 @@ def listed_adjoint(
         row_positions: wp.array[vector],
         row_kernel_sum: wp.array[vector],
         perception_bar: wp.array2d[scalar],
-        cotangents: wp.array[CHANNELS],
+        cotangents: wp.array[FOUR_CHANNELS],
         flat_cotangents: wp.array[scalar],
         # outputs
         states_bar: wp.array2d[scalar],
@@ -348,7 +348,7 @@ def listed_adjoint(
         cell = space.cell_of(domain, position)
         line = search.line_of(domain, cell)
         address = row_list_address()
-        total = CHANNELS()
+        total = FOUR_CHANNELS()
         # A position that is not finite has no neighbours.
         waiting = k < end and search.is_finite(position)
         while any_in_warp(waiting):
@@ -368,7 +368,7 @@ def listed_adjoint(
             votes = vote_of_warp(served) >> wp.uint32(8 * (lane & 3))
             count = wp.int32(0)
             block = wp.int32(0)
-            block_sums = CHANNELS()
+            block_sums = FOUR_CHANNELS()
             for first_run in range(0, run_count, wp.static(WARP)):
                 run = first_run + lane
                 run_begin = wp.int32(0)
@@ -412,7 +412,7 @@ def listed_adjoint(
                                 if (votes & wp.uint32(1 << (4 * n))) != wp.uint32(0):
                                     total[n] += block_sums[n]
                                     total[n + 2] += block_sums[n + 2]
-                            block_sums = CHANNELS()
+                            block_sums = FOUR_CHANNELS()
                             block = wp.int32(0)
         total = regroup_tile(total)
         if written < end and part < wp.static(parts) and channel < state_dim:

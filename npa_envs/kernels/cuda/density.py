@@ -3,16 +3,15 @@
 `listed_density`: one thread finds a particle's neighbours with far fewer instructions than several,
 which would have to agree on positions in the list. A list has the differences of sorted indices
 from the particle to its neighbours, in 16 bits. It is made in shared memory and written to an array
-in which the lists of 32 particles are interleaved, two entries at a time. Of a list beyond the
-capacity only the length is written.
+in which the lists of 32 particles are interleaved, two entries at a time.
 
 `tiled_density`, for small worlds in 2D: a warp serves a tile of eight consecutive particles, whose
 lists are stored one after the other. They are in one or two lines of cells, so most candidates are
-the same, and the warp copies these into shared memory once. Each of a particle's four lanes tests
-every fourth candidate: ten instructions, without addresses or ends of runs. It stores the results
-as bits, from which lists are made afterwards. That halves the time for few particles with many
-neighbours. In sparse worlds tiles share few candidates, and worlds that fill a GPU need only a
-thread for each particle. Worlds have at most 2^15 particles: entries of lists have 16 bits.
+the same, and the warp copies these into shared memory once. Each of a particle's four lanes (the
+threads that share it) tests every fourth candidate: ten instructions, without addresses or ends of
+runs. It stores the results as bits, from which lists are made afterwards. That halves the time for
+few particles with many neighbours. In sparse worlds tiles share few candidates, and worlds that
+fill a GPU need only a thread for each particle. Worlds have at most 2^15 particles.
 """
 
 import warp as wp
@@ -33,22 +32,22 @@ from npa_envs.kernels.primitives import (
 from npa_envs.thread_lock import cached_under_lock
 
 AHEAD, SHARED_AHEAD = 6, 5
-"""Candidates that a thread loads at a time, if a particle has one lane, and if it has several."""
+"""Candidates that a thread loads at a time: if a particle has one thread, and if it has several."""
 
 LIST_BLOCK = 64
 """Threads of a block: few, as their lists have to fit into shared memory."""
 
-CUDA_REGISTERS = 80
-"""Registers per thread; by default the compiler takes half as many and issues loads one by one."""
+LIST_REGISTERS = 80
+"""Registers per thread of `listed_density`: with the default, half as many, loads come singly."""
 
 RECORD = wp.types.vector(4, wp.float32)
 """A neighbour's data for perception: position, volume, and in 2D the index of its state."""
 
 MAX_STEP = wp.constant(2**15 - 1)
-"""Largest step of a list: entries have 16 bits."""
+"""Largest difference of sorted indices in a list: its entries have 16 bits."""
 
 SHARE_OF_LIST = 2
-"""Room of each of several lanes, as a multiple of an equal part of a list."""
+"""Room for the entries of each of several lanes, as a multiple of an equal part of a list."""
 
 LIST_END = wp.types.vector(2, wp.uint32)
 """Address of a list's next entry, and the distance [bytes] from it to the one after."""
@@ -60,7 +59,7 @@ TILE_PARTICLES, TILE_LANES, MIN_SIDE = native.constants(
 periodic box that is divided into tiles."""
 
 TILE_REGISTERS = 64
-"""Registers per thread, so that a multiprocessor runs 32 warps."""
+"""Registers per thread of `tiled_density`, so that a multiprocessor runs 32 warps."""
 
 
 @cached_under_lock()
@@ -125,7 +124,7 @@ def listed_density(
     options = {"lanes": lanes, "periodic": periodic, "capacity": capacity, "masked": masked}
     module = kernel_module("listed_density", space_dim, scalar, **options)
 
-    @wp.kernel(module=module, cuda_max_registers=CUDA_REGISTERS, grid_stride=False)
+    @wp.kernel(module=module, cuda_max_registers=LIST_REGISTERS, grid_stride=False)
     def compute_density(
         domain: Domain,
         starts: wp.array[wp.int32],

@@ -18,10 +18,10 @@ READ_WARPS, PULL_WARPS, STEER_WARPS, MIXING_SUM_WARPS = 4, 4, 4, 16
 """Warps of a block of `read_rows`, `pull_back_rows`, the steering kernels and `add_blocks`."""
 
 STEERED_ROWS = 2
-"""Rows that a warp steers."""
+"""Rows of outputs from which a warp computes updates."""
 
 MAX_MIXING = 1024
-"""Most mixing weights: each thread sums gradients of every 32nd of them."""
+"""Maximum number of mixing weights: each thread sums gradients of every 32nd of them."""
 
 SHARED_BYTES = 48 * 1024
 """Shared memory of a block that the driver grants by default [bytes]."""

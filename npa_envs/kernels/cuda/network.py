@@ -91,8 +91,7 @@ def weight_gradient_kernels(
     weight_sums = native.function(
         "weight_sums",
         *sizes,
-        untyped="unit_count part_rows rows output_bar signs hidden_weights output_weights "
-        "partial_sums",
+        untyped="unit_count part_rows rows output_bar signs hidden_weights output_weights sums",
     )
     add_partial_sums = native.function("add_partial_sums", SUM_WARPS, untyped="partial_sums total")
 
@@ -106,20 +105,13 @@ def weight_gradient_kernels(
         hidden_weights: wp.array[wp.bfloat16],
         output_weights: wp.array[wp.bfloat16],
         # outputs
-        partial_sums: wp.array2d[wp.float32],
+        sums: wp.array2d[wp.float32],
     ):
         """Write both layers' weight gradients, summed over each range of `part_rows` rows."""
         wait_for_previous_kernel()
         allow_next_launch()
         weight_sums(
-            unit_count,
-            part_rows,
-            rows,
-            output_bar,
-            signs,
-            hidden_weights,
-            output_weights,
-            partial_sums,
+            unit_count, part_rows, rows, output_bar, signs, hidden_weights, output_weights, sums
         )
 
     @wp.kernel(module=module)

@@ -1,4 +1,4 @@
-// For cuda/perceive.py: a particle's scratch, and the reading of states and writing of rows.
+// For cuda/perceive.py: perception; access to states and to a particle's scratch, writing of rows.
 //
 // The scratch is the part of shared memory that the lanes of a particle use. It contains a short
 // list of neighbours, first only their indices, then each with its weights; at the end it contains

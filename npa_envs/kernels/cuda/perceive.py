@@ -52,7 +52,7 @@ from npa_envs.kernels.primitives import (
 )
 from npa_envs.thread_lock import cached_under_lock
 
-CUDA_REGISTERS, TEAM_REGISTERS = {2: 80, 3: 112}, 128
+PERCEIVE_REGISTERS, TEAM_REGISTERS = {2: 80, 3: 112}, 128
 """Registers per thread: for one team per particle, by space dimension, and for several teams."""
 
 PAIR = 2
@@ -62,8 +62,7 @@ TOGETHER = 4
 """Neighbours whose states a lane loads at a time; a divisor of `SCRATCH_ENTRIES`."""
 
 SCRATCH_ENTRIES = 32
-"""Neighbours that the scratch has room for, a multiple of `PAIR` times the lanes; more neighbours
-take several rounds."""
+"""Neighbours of a full scratch, a multiple of `PAIR` times the lanes; more take several rounds."""
 
 CANDIDATES = 16
 """Candidates that all lanes of a particle load together in a search."""
@@ -197,10 +196,7 @@ def scratch_functions(variant: PerceptionVariant, space: SimpleNamespace) -> Sim
 
 
 def weighing_functions(variant: PerceptionVariant, space: SimpleNamespace) -> SimpleNamespace:
-    """Return the functions that write neighbours' kernel weights to the scratch.
-
-    A lane also adds its neighbours' terms of all sums that need no states.
-    """
+    """Return the functions that write weights to the scratch, and add terms without states."""
     space_dim, lanes, periodic = variant.space_dim, variant.lanes, variant.periodic
     state_gradient, moment_correction = variant.state_gradient, variant.moment_inverse is not None
     scalar, vector, vector_f64 = space.scalar, space.vector, space.vector_f64
@@ -504,7 +500,7 @@ def listed_perception(variant: PerceptionVariant) -> wp.Kernel:
     width, lane_width, team = variant.width, variant.lane_width, CUDA_LANES
     space = scratch_functions(variant, thread_types(variant))
     scalar, vector, lane_channels, Domain = space.scalar, space.vector, space.group, space.Domain
-    registers = CUDA_REGISTERS[space_dim] if teams == 1 else TEAM_REGISTERS
+    registers = PERCEIVE_REGISTERS[space_dim] if teams == 1 else TEAM_REGISTERS
     load_vector = make_wide_load(vector)
     add_vector = make_lane_sum(vector, lanes, whole_warps=True)
     add_square = make_lane_sum(space.square, lanes, whole_warps=True)

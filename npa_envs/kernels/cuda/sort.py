@@ -38,7 +38,7 @@ RESIDENT_THREADS = 1024
 """Threads for which a multiprocessor has enough registers."""
 
 MAX_GRID = 4096
-"""Most cells of a world that a block sorts."""
+"""Maximum number of cells of a world that a block sorts."""
 
 THREAD_CHANNELS = 4
 """Adjacent channels that a thread moves."""

@@ -54,7 +54,7 @@ PATCH_WIDTH, PATCH_HEIGHT = 8, 4
 """Pixels of a tile that a warp serves: nearly square, so that it can skip most Gaussians."""
 
 BATCH = 32
-"""Pairs whose cotangents a block keeps in shared memory before it adds those of its warps."""
+"""Pairs whose gradients a block keeps in shared memory before it adds those of its warps."""
 
 TO_POWER_OF_TWO = -0.7213475204444817
 """-1/2 log2(e), the factor of p in exp(-1/2 p) as a power of two."""

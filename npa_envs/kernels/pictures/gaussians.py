@@ -272,8 +272,8 @@ def gaussian_functions(scalar: type) -> SimpleNamespace:
 def gaussian_kernels(scalar: type) -> SimpleNamespace:
     """Return the kernels that project 3D Gaussians, list the tiles they cover, and pull back."""
     module = native.module(f"npa_envs.kernels.gaussians_{scalar_name(scalar)}")
-    adjoint = adjoint_kernel(scalar, module)
-    return SimpleNamespace(**vars(projection_kernels(scalar, module)), pull_back_gaussians=adjoint)
+    kernels = vars(projection_kernels(scalar, module))
+    return SimpleNamespace(**kernels, pull_back_gaussians=adjoint_kernel(scalar, module))
 
 
 def projection_kernels(scalar: type, module: wp.Module) -> SimpleNamespace:

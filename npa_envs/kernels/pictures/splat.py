@@ -31,19 +31,19 @@ from npa_envs.kernels.primitives import (
 from npa_envs.thread_lock import cached_under_lock
 
 CHANNELS = 4
-"""Red, green, blue and density."""
+"""Channels of a picture: red, green, blue and density."""
 
 TILE_WIDTH, TILE_HEIGHT = 4, 4
-"""Pixels of a tile, which `TILE_LANES` CUDA threads gather, and of a cell."""
+"""Pixels along each side of a tile, which `TILE_LANES` CUDA threads gather, and of a cell."""
 
 TILE_LANES = 4
-"""CUDA threads that share a tile's candidates, or a particle's cotangents; on a CPU it is one."""
+"""CUDA threads that share a tile's candidates, or a particle's gradients; on a CPU it is one."""
 
 RUNS = 3
 """Runs of particles, one for each row of cells, that are gathered as one."""
 
-CUDA_REGISTERS = 128
-"""Registers per thread in the gathering of float32, enough for all sums of a tile."""
+GATHER_REGISTERS = 128
+"""Registers per thread of `gather_splats` in float32, enough for all sums of a tile."""
 
 GROUP_WIDTH, GROUP_HEIGHT = 4, 2
 """Tiles of a group, which one warp gathers."""
@@ -120,7 +120,7 @@ def make_view(
 
 def gather_registers(scalar: type) -> int | None:
     """Return the maximum number of registers per thread of `gather_splats`; None: no limit."""
-    return CUDA_REGISTERS if scalar == wp.float32 else None
+    return GATHER_REGISTERS if scalar == wp.float32 else None
 
 
 def group_count(resolution: int) -> int:

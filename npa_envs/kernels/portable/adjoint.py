@@ -1,4 +1,4 @@
-"""Hand-written adjoints of the perception pass, gathered: no float atomics, a fixed order of sums.
+"""Hand-written backward pass of perception: no float atomics, a fixed order of sums.
 
 Notation: centre i perceives neighbour j at r = x_j - x_i, with smoothing W_ij, spiky gradient
 K_ij = f r and volume v_j = 1 / ρ_j. x̄ (`x_bar`) = dL/dx, the gradient of the loss L: b̄_i by centre
@@ -29,8 +29,8 @@ from npa_envs.kernels.portable.search import make_search
 from npa_envs.kernels.primitives import make_add_scaled, make_wide_load
 from npa_envs.thread_lock import cached_under_lock
 
-CUDA_REGISTERS = 64
-"""Registers per thread in the gathering of state cotangents, which mostly waits for memory."""
+STATE_REGISTERS = 64
+"""Registers per thread of `gather_state_cotangents`, which mostly waits for memory."""
 
 
 @cached_under_lock()
@@ -152,7 +152,7 @@ def state_kernel(
         return near, count
 
     @in_ranges(PAIRS)
-    @wp.kernel(module=module, cuda_max_registers=CUDA_REGISTERS)
+    @wp.kernel(module=module, cuda_max_registers=STATE_REGISTERS)
     def gather_state_cotangents(
         range_start: int,
         domain: space.Domain,

@@ -1,7 +1,7 @@
-"""Counter-based random draws: Philox4x32-10, and distributions from its 32-bit words.
+"""Counter-based random numbers: Philox4x32-10, and distributions from its 32-bit words.
 
 A word is a function only of a world's key and a counter (element, step, draw, episode), so a
-world's draws depend neither on other worlds nor on the device.
+world's random numbers depend neither on other worlds nor on the device.
 
 Source: Salmon, Moraes, Dror and Shaw, "Parallel random numbers: as easy as 1, 2, 3" (SC 2011).
 """

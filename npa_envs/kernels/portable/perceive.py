@@ -23,7 +23,7 @@ from npa_envs.kernels.portable.search import make_search
 from npa_envs.kernels.primitives import make_add_scaled, make_wide_load
 from npa_envs.thread_lock import cached_under_lock
 
-CUDA_REGISTERS = 128
+PERCEIVE_REGISTERS = 128
 """Registers per thread of the perception pass: more threads at a time are worth a few spills."""
 
 
@@ -111,7 +111,7 @@ def perception_kernels(
         return result
 
     @in_ranges(PAIRS)
-    @wp.kernel(module=module, cuda_max_registers=CUDA_REGISTERS)
+    @wp.kernel(module=module, cuda_max_registers=PERCEIVE_REGISTERS)
     def perceive(
         range_start: int,
         domain: Domain,

@@ -1,4 +1,4 @@
-"""Cell lists by counting sort, in an order that depends on the particles alone.
+"""Cell lists by counting sort, in an order that depends only on the particles.
 
 Particles are sorted by world, then cell, then index. A row of cells is contiguous, so that the
 neighbourhood of a cell is a few contiguous runs of particles. The particles whose update mask is
