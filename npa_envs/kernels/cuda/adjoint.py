@@ -13,7 +13,7 @@ from typing import Any
 import warp as wp
 
 from npa_envs.kernels import native_functions as native
-from npa_envs.kernels.domain import SLACK, TERMS_PER_SUM, domain_types, kernel_module
+from npa_envs.kernels.domain import SLACK, TERMS_PER_SUM, group_types, kernel_module
 from npa_envs.kernels.primitives import (
     CUDA_BLOCK,
     WARP,
@@ -41,11 +41,8 @@ TILE_PARTICLES = 8
 LIST_ENTRIES = 96
 """Rows of a full list; more rows are summed in several rounds."""
 
-ENTRY = wp.types.vector(4, wp.float32)
-"""Entry of a list, a row: the position of its particle, and last the index of its channels."""
-
-FOUR_CHANNELS = wp.types.vector(4, wp.float32)
-"""Four adjacent channels."""
+ENTRY = FOUR_CHANNELS = wp.types.vector(4, wp.float32)
+"""A listed row: the position of its particle, last the index of its channels; or four channels."""
 
 STATE_REGISTERS = 64
 """Registers per thread of `gather_state_cotangents`."""
@@ -98,11 +95,10 @@ smallest_in_tile = native.function("smallest_in_tile", value=float, returns=floa
 """The smallest value among a warp's 8 particles, each of which has four threads."""
 
 
-def row_search(space_dim: int, periodic: bool) -> SimpleNamespace:
+def row_search(space: SimpleNamespace, periodic: bool) -> SimpleNamespace:
     """Return the functions that find rows near 8 particles: by runs of cells, then by distance."""
-    scalar = wp.float32
-    space = domain_types(space_dim, scalar)
-    vector, cell_vector, Domain = space.vector, space.cell_vector, space.Domain
+    space_dim, scalar, Domain = space.space_dim, space.scalar, space.Domain
+    vector, cell_vector = space.vector, space.cell_vector
 
     @wp.func
     def line_of(domain: Domain, cell: cell_vector):
@@ -225,24 +221,22 @@ def listed_adjoint(
     channels if `grouped`. The gradients by perception of a row and group are contiguous, [1 + D,
     width]: of the smoothed state, then of the state gradient. Zeros follow those of the last row.
     """
-    scalar = wp.float32
-    space = domain_types(space_dim, scalar)
-    vector, Domain = space.vector, space.Domain
-    thread_gradient = wp.types.matrix((space_dim, THREAD_CHANNELS), scalar)
-    weight_count = 1 + space_dim if state_gradient else 1
     options = {"gradient": state_gradient, "periodic": periodic, "grouped": grouped}
-    module = kernel_module("listed_adjoint", space_dim, scalar, width=width, **options)
-    load_vector = make_wide_load(vector)
-    search = row_search(space_dim, periodic)
-    parts = width // THREAD_CHANNELS
-    # Of a warp's 8 particles: the sum of the listed rows' cotangents, weighted by kernels.
-    rows = {"address": wp.uint32, "count": int, "domain": Domain, "position": vector}
-    values = {"channels": wp.array[scalar], "value": FOUR_CHANNELS}
-    sizes = space_dim, width, weight_count, periodic
-    sum_listed = native.function("sum_listed", *sizes, **rows, **values, returns=FOUR_CHANNELS)
-    log_scale_cotangent = native.function(
-        "log_scale_cotangent", scaled=vector, cotangent=vector, returns=vector
+    module = kernel_module("listed_adjoint", space_dim, wp.float32, width=width, **options)
+    space = group_types(space_dim, wp.float32, width)
+    return SimpleNamespace(
+        unscale_cotangents=unscaling_kernel(space, module, state_gradient),
+        gather_state_cotangents=state_kernel(space, module, state_gradient, periodic, grouped),
     )
+
+
+def unscaling_kernel(space: SimpleNamespace, module: wp.Module, state_gradient: bool) -> wp.Kernel:
+    """Return the kernel that pulls gradients back through the logarithmic scaling."""
+    space_dim, scalar, vector = space.space_dim, space.scalar, space.vector
+    weight_count, parts = 1 + space_dim * state_gradient, space.width // THREAD_CHANNELS
+    thread_gradient = wp.types.matrix((space_dim, THREAD_CHANNELS), scalar)
+    vectors = {"scaled": vector, "cotangent": vector}
+    log_scale_cotangent = native.function("log_scale_cotangent", **vectors, returns=vector)
     read_gradients = make_read_columns(THREAD_CHANNELS * space_dim)
 
     @wp.kernel(module=module, grid_stride=False)
@@ -294,9 +288,25 @@ def listed_adjoint(
                 for d in range(wp.static(space_dim)):
                     wide_store(cotangents, index + (d + 1) * wp.static(parts), gradient_bars[d])
 
+    return unscale_cotangents
+
+
+def state_kernel(
+    space: SimpleNamespace, module: wp.Module, state_gradient: bool, periodic: bool, grouped: bool
+) -> wp.Kernel:
+    """Return the kernel that computes dL/d(states) from the result of `unscale_cotangents`."""
+    space_dim, scalar, width, vector = space.space_dim, space.scalar, space.width, space.vector
+    weight_count, parts = 1 + space_dim * state_gradient, width // THREAD_CHANNELS
+    load_vector, search = make_wide_load(vector), row_search(space, periodic)
+    # Of a warp's 8 particles: the sum of the listed rows' cotangents, weighted by kernels.
+    rows = {"address": wp.uint32, "count": int, "domain": space.Domain, "position": vector}
+    values = {"channels": wp.array[scalar], "value": FOUR_CHANNELS}
+    sizes = space_dim, width, weight_count, periodic
+    sum_listed = native.function("sum_listed", *sizes, **rows, **values, returns=FOUR_CHANNELS)
+
     @wp.kernel(module=module, cuda_max_registers=STATE_REGISTERS, grid_stride=False)
     def gather_state_cotangents(
-        domain: Domain,
+        domain: space.Domain,
         norm: scalar,
         particle_count: int,
         tile_count: int,
@@ -429,6 +439,4 @@ def listed_adjoint(
                         )
             write_columns(states_bar, i, channel, bar)
 
-    return SimpleNamespace(
-        unscale_cotangents=unscale_cotangents, gather_state_cotangents=gather_state_cotangents
-    )
+    return gather_state_cotangents

@@ -37,8 +37,9 @@ AHEAD, SHARED_AHEAD = 6, 5
 LIST_BLOCK = 64
 """Threads of a block: few, as their lists have to fit into shared memory."""
 
-LIST_REGISTERS = 80
-"""Registers per thread of `listed_density`: with the default, half as many, loads come singly."""
+LIST_REGISTERS, TILE_REGISTERS = 80, 64
+"""Registers per thread of `listed_density` (with the default, half as many, loads come singly) and
+of `tiled_density`, for 32 warps on a multiprocessor."""
 
 RECORD = wp.types.vector(4, wp.float32)
 """A neighbour's data for perception: position, volume, and in 2D the index of its state."""
@@ -57,9 +58,6 @@ TILE_PARTICLES, TILE_LANES, MIN_SIDE = native.constants(
 )
 """Particles of a tile, lanes of a warp that share one, and cells along each side of the smallest
 periodic box that is divided into tiles."""
-
-TILE_REGISTERS = 64
-"""Registers per thread of `tiled_density`, so that a multiprocessor runs 32 warps."""
 
 
 @cached_under_lock()

@@ -34,11 +34,8 @@ load_pair = make_wide_load(wp.vec2i)
 BLOCKS = {1024: 256, 4096: 1024}
 """Threads of a block by its capacity in particles."""
 
-RESIDENT_THREADS = 1024
-"""Threads for which a multiprocessor has enough registers."""
-
-MAX_GRID = 4096
-"""Maximum number of cells of a world that a block sorts."""
+RESIDENT_THREADS, MAX_GRID = 1024, 4096
+"""Threads for which a multiprocessor has registers; maximum cells of a world that a block sorts."""
 
 THREAD_CHANNELS = 4
 """Adjacent channels that a thread moves."""

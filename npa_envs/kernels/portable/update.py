@@ -371,11 +371,8 @@ def action_kernel(space_dim: int, scalar: type) -> wp.Kernel:
     return apply_actions
 
 
-QUAD = 4
-"""Values that a thread reads at once."""
-
-VALUES_PER_THREAD = 8
-"""Values that a thread checks."""
+QUAD, VALUES_PER_THREAD = 4, 8
+"""Values that a thread of `flag_not_finite` reads at once, and values that it checks."""
 
 
 @cached_under_lock()
