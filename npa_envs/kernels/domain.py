@@ -38,7 +38,7 @@ def scalar_name(scalar: type) -> str:
 
 @cached_under_lock()
 def kernel_module(name: str, space_dim: int, scalar: type, **options: int) -> wp.Module:
-    """Return the Warp module of kernels such as "sort": one for each combination of options."""
+    """Return the Warp module of kernels such as "sort"; each combination of options has one."""
     words = [name, f"{space_dim}d", scalar_name(scalar)]
     for option, value in options.items():
         if value is not False:
@@ -54,7 +54,7 @@ def domain_types(space_dim: int, scalar: type) -> SimpleNamespace:
     """
     vector = wp.types.vector(space_dim, scalar)
     cell_vector = wp.types.vector(space_dim, wp.int32)
-    double_vector = wp.types.vector(space_dim, wp.float64)
+    vector_f64 = wp.types.vector(space_dim, wp.float64)
     particle = wp.types.vector(space_dim + 1, scalar)
 
     @wp.struct
@@ -67,7 +67,7 @@ def domain_types(space_dim: int, scalar: type) -> SimpleNamespace:
         periodic: int
         box: vector
         inverse_box: vector
-        cell_scale: double_vector
+        cell_scale: vector_f64
         cell_shape: cell_vector
         cell_count: int
         cells_per_eps: int
@@ -126,7 +126,7 @@ def domain_types(space_dim: int, scalar: type) -> SimpleNamespace:
 
     @wp.func
     def segment_count(domain: Domain, cell: cell_vector):
-        """Return the number of runs around a cell: one for each line of cells, two if it wraps."""
+        """Return the number of runs of cells around a cell: 1 or, if it wraps, 2 for each line."""
         lines = wp.int32(1)
         for d in range(1, wp.static(space_dim)):
             lines *= cells_around(domain, d)
@@ -137,7 +137,7 @@ def domain_types(space_dim: int, scalar: type) -> SimpleNamespace:
 
     @wp.func
     def segment_cells(domain: Domain, cell: cell_vector, segment: int):
-        """Return the first and last + 1 cell, in row-major order, of run number `segment`."""
+        """Return first and last + 1 cell (row-major) of run number `segment` around a cell."""
         width = cells_around(domain, 0)
         nx = domain.cell_shape[0]
         first = wrapped(cell[0] - domain.cells_per_eps, nx)
@@ -172,7 +172,7 @@ def domain_types(space_dim: int, scalar: type) -> SimpleNamespace:
 
     @wp.func
     def minimum_image(domain: Domain, difference: vector):
-        """Return `periodic_image` of a difference in a box, the difference in open space."""
+        """Return `periodic_image` of a difference in a box; in open space the difference itself."""
         result = difference
         if domain.periodic != 0:
             result = periodic_image(domain, difference)
@@ -186,7 +186,7 @@ def domain_types(space_dim: int, scalar: type) -> SimpleNamespace:
     @wp.func
     def difference_f64(domain: Domain, centre: vector, neighbour: vector):
         """Return the minimum image of neighbour - centre, in float64 [length units]."""
-        result = double_vector()
+        result = vector_f64()
         for d in range(wp.static(space_dim)):
             result[d] = wp.float64(neighbour[d]) - wp.float64(centre[d])
             if domain.periodic != 0:
@@ -200,7 +200,20 @@ def domain_types(space_dim: int, scalar: type) -> SimpleNamespace:
             result[d] = entry[d]
         return result
 
-    return native.namespace(locals(), vector=vector, particle=particle, Domain=Domain)
+    types = {"vector": vector, "vector_f64": vector_f64, "cell_vector": cell_vector}
+    return native.namespace(locals(), **types, particle=particle, Domain=Domain)
+
+
+@cached_under_lock()
+def group_types(space_dim: int, scalar: type, width: int) -> SimpleNamespace:
+    """Return `domain_types`, its arguments, and types of a group [width] and its gradient."""
+    return SimpleNamespace(
+        **vars(domain_types(space_dim, scalar)),
+        **{"space_dim": space_dim, "scalar": scalar, "width": width},
+        group=wp.types.vector(width, scalar),
+        group_gradient=wp.types.matrix((space_dim, width), scalar),
+        square=wp.types.matrix((space_dim, space_dim), scalar),
+    )
 
 
 @functools.lru_cache(maxsize=256)
@@ -213,9 +226,9 @@ def cell_grid(
 ) -> tuple[int, ...]:
     """Return the number of cells of a world's grid along each dimension.
 
-    Open space gets about one cell for each particle (a power of two along each dimension: the grid
-    wraps around). A periodic box is divided into cells no smaller than eps / cells_per_eps, into at
-    most four times as many as open space has.
+    Open space (`box` None) gets about one cell for each particle: a power of two along each
+    dimension, because the grid wraps around. A periodic box is divided into cells no smaller than
+    eps / cells_per_eps, into at most four times as many as open space has.
     """
     open_side = 8
     while open_side**space_dim < particle_count:
@@ -239,7 +252,7 @@ def make_domain(
     particle_count: int,
     cells_per_eps: int = 2,
 ) -> Any:
-    """Return the `Domain` of worlds of N particles, in cells of side eps / cells_per_eps."""
+    """Return the `Domain` of worlds; cells have side eps / cells_per_eps. No `box`: open space."""
     types = domain_types(space_dim, scalar)
     domain = types.Domain()
     domain.inverse_eps = 1.0 / eps

@@ -1,4 +1,4 @@
-// Formulas of perception for mathematics.py, and exp2 for pictures/*.py, in few instructions.
+// For mathematics.py and pictures/*.py: formulas of perception, and exp2, in few instructions.
 
 namespace npa {
 

@@ -3,6 +3,7 @@
 Sources: arXiv 2601.16096, section 3 and appendix; `npa_envs.reference` has the same in torch.
 """
 
+from types import SimpleNamespace
 from typing import Any
 
 import warp as wp
@@ -123,7 +124,7 @@ def log_scale_tangential(length: Any):
 
 @wp.func
 def log_scale_adjoint(scaled: Any, cotangent: Any):
-    """Loss gradient by v, from `cotangent`, that by L(v) of `log_scaled`, and `scaled` = L(v)."""
+    """Loss gradient by v from `cotangent`, the loss gradient by L(v), and from `scaled` = L(v)."""
     length = wp.length(scaled)
     tangential = log_scale_tangential(length)
     result = tangential * cotangent
@@ -146,7 +147,7 @@ def perception_module_name(state_gradient: bool, moment_inverse: str | None) -> 
 def make_corrected(space_dim: int, scalar: type, width: int, moment_inverse: str | None) -> Any:
     """Return a Warp function that multiplies state gradients [D, width] by an inverse of moments M.
 
-    The inverse is "smooth", or "threshold", which leaves gradients unchanged where M is singular.
+    The inverse is "smooth", or "threshold", which leaves gradients as they are where M is singular.
     """
     square = wp.types.matrix((space_dim, space_dim), scalar)
     gradient_type = wp.types.matrix((space_dim, width), scalar)
@@ -211,3 +212,54 @@ inverse_root = native.function("inverse_root", value=float, returns=float)
 
 within = native.function("within", value=float, limit=float, returns=float)
 """The value clipped to plus and minus a limit; unchanged if the limit is NaN."""
+
+
+def scaling_functions(space: SimpleNamespace) -> SimpleNamespace:
+    """Return the functions for logarithmic scaling L on CUDA, with the types of `group_types`."""
+    space_dim, width, scalar = space.space_dim, space.width, space.scalar
+    vector, gradient_type = space.vector, space.group_gradient
+    rows_type = wp.types.vector(width * space_dim, scalar)
+
+    @wp.func
+    def scale_huge(gradient_scale: scalar, gradient: gradient_type, scaled: rows_type):
+        """Return `scaled`, computed again for gradients whose squared length overflows."""
+        result = scaled
+        for c in range(wp.static(width)):
+            along = vector()
+            for d in range(wp.static(space_dim)):
+                along[d] = gradient_scale * gradient[d, c]
+            if wp.isinf(wp.dot(along, along)):
+                along = log_scaled_huge(along)
+                for d in range(wp.static(space_dim)):
+                    result[c * wp.static(space_dim) + d] = along[d]
+        return result
+
+    @wp.func
+    def scaled_gradient(gradient_scale: scalar, gradient: gradient_type):
+        """Return L(`gradient_scale` times gradient) of each channel, one after the other."""
+        scaled = rows_type()
+        largest_square = scalar(0.0)
+        for c in range(wp.static(width)):
+            along = vector()
+            for d in range(wp.static(space_dim)):
+                along[d] = gradient_scale * gradient[d, c]
+            squared = wp.dot(along, along)
+            largest_square = wp.max(largest_square, squared)
+            along *= log_scale_of_square(squared)
+            for d in range(wp.static(space_dim)):
+                scaled[c * wp.static(space_dim) + d] = along[d]
+        if wp.isinf(largest_square):
+            scaled = scale_huge(gradient_scale, gradient, scaled)
+        return scaled
+
+    @wp.func
+    def scaled_vector(v: vector):
+        result = v
+        squared = wp.dot(v, v)
+        if wp.isinf(squared):
+            result = log_scaled_huge(v)
+        else:
+            result *= log_scale_of_square(squared)
+        return result
+
+    return native.namespace(locals())

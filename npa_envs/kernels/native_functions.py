@@ -35,7 +35,7 @@ CUDA_ONLY = (
 
 @cached_under_lock()
 def build_options() -> wp.ModuleBuildOptions:
-    """Return Warp's options that put the text of the C++ files into a module, and into its hash."""
+    """Return Warp's module options that put the C++ files' text into the code and its hash."""
     for_cpu = "".join(map(_text_of, BOTH_DEVICES))
     for_cuda = for_cpu + "".join(map(_text_of, CUDA_ONLY))
     return wp.ModuleBuildOptions(extra_cpu_preamble=for_cpu, extra_cuda_preamble=for_cuda)
@@ -52,9 +52,10 @@ def constants(file: str, *names: str) -> list[int]:
 
 
 def module(name: str) -> wp.Module:
-    """Return the Warp module `name`, whose kernels may call native functions."""
+    """Return the Warp module `name`: its kernels may call native functions, and have no adjoint."""
     result = wp.get_module(name)
-    wp.set_module_options({"extra_build_options": build_options()}, result)
+    options = {"enable_backward": False, "extra_build_options": build_options()}
+    wp.set_module_options(options, result)
     return result
 
 
@@ -64,8 +65,8 @@ def function(
     """Return a Warp function that calls `npa::name`, a C++ function of the `.cuh` files.
 
     `parameters` are the template parameters that C++ cannot deduce: numbers, booleans, types, names
-    of constants in `npa`. `arguments` are the types of arguments by name. `untyped`: names,
-    separated by spaces, of arguments of any type; a function with a result (`returns`) has none.
+    of constants in `npa`. `arguments` are types by name. `untyped` has the names, separated by
+    spaces, of arguments of any type; a function with a result, of type `returns`, has none.
     """
     arguments = dict.fromkeys(untyped.split(), Any) | arguments
     template = f"<{', '.join(map(_in_cpp, parameters))}>" if parameters else ""
@@ -114,31 +115,19 @@ def _in_cpp(parameter: Any) -> str:
 # CPU work for one thread only.
 
 MIN_RANGES: dict[Any, int] = {}
-"""For each such kernel, the fewest indices of the first dimension in a range."""
+"""Minimum number of indices in a range, by kernel."""
 
-PAIRS = 512
-"""Smallest range of a kernel in which each index sums over a neighbourhood."""
-
-WORLDS = 2
-"""Smallest range of a kernel in which each index runs through a complete world."""
-
-CAMERAS = 1
-"""Smallest range of a kernel in which each index draws the picture of a camera."""
-
-TILES = 4
-"""Smallest range of a kernel in which each index draws a tile of a picture."""
-
-PARTICLES = 4096
-"""Smallest range of a kernel in which each index moves a particle with its state."""
-
-ELEMENTS = 16384
-"""Smallest range of a kernel in which each index changes a few numbers."""
+PAIRS, WORLDS, CAMERAS, TILES, PARTICLES, ELEMENTS = 512, 2, 1, 4, 4096, 16384
+"""Minimum numbers of indices in a range, for kernels in which each index sums over a neighbourhood,
+runs through a world, draws the picture of a camera, draws a tile of a picture, moves a particle
+with its state, or changes a few numbers."""
 
 
 def in_ranges(smallest: int) -> Callable[[Any], Any]:
-    """Return a decorator for a Warp kernel whose launches CPU threads share, in ranges of indices.
+    """Return a decorator for Warp kernels whose launches are split into ranges for CPU threads.
 
-    `smallest` indices of the first dimension take about 0.15 ms; a split costs half of that.
+    A range has at least `smallest` indices of the first dimension, which take about 0.15 ms; a
+    split costs half of that.
     """
 
     def mark(kernel: Any) -> Any:

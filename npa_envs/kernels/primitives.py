@@ -1,9 +1,9 @@
 """Access to memory and to other threads' values: wide loads and stores, sums over lanes, votes.
 
-On CUDA a few adjacent threads, called lanes, may share one particle: with n lanes each sums every
-n-th candidate, and warp shuffles then add the lanes' sums in a fixed order. Short sums go to every
-lane; of long ones each lane gets some of the columns. On a CPU a particle has one lane, and the
-same source runs without shuffles.
+On CUDA a few adjacent threads of a warp, called its lanes, may share one particle: each of n lanes
+sums every n-th candidate, and warp shuffles then add the lanes' sums in a fixed order. Every lane
+gets short sums; each lane gets some columns of long sums. On a CPU a particle has one lane, and
+the same source runs without shuffles.
 
 Functions of factories and `of_warp` run on both devices. The others run on CUDA only, and all
 threads of a warp must call them together.
@@ -24,7 +24,6 @@ WARP = 32
 
 CUDA_BLOCK = 128
 """Default number of threads of a block."""
-
 
 wait_for_previous_kernel = native.function("wait_for_previous_kernel")
 """Wait for earlier launches; kernels call it first, before they access memory.
@@ -58,7 +57,7 @@ wide_store = native.function("wide_store", untyped="entries index value")
 
 
 def scalar_of(value_type: Any) -> Any:
-    """Return the scalar type of a vector's or a matrix's entries; a scalar type itself."""
+    """Return the type of a vector's or a matrix's entries; a scalar type itself."""
     return getattr(value_type, "_wp_scalar_type_", value_type)
 
 
@@ -76,7 +75,7 @@ def make_read_at(value_type: type, alignment: int) -> Any:
 
 @cached_under_lock()
 def make_read_channels(value_type: Any) -> Any:
-    """Return a Warp function that reads adjacent channels of a particle, 0 beyond the last one."""
+    """Return a Warp function that reads adjacent channels of a particle; 0 beyond the last one."""
     scalar, count = scalar_of(value_type), value_type._length_
     read_at = make_read_at(value_type, min(wp.types.type_size_in_bytes(value_type), 16))
 
@@ -103,10 +102,10 @@ write_at = native.function("write_at", untyped="values index value")
 
 @cached_under_lock()
 def make_lane_sum(value_type: type, lanes: int, whole_warps: bool = False, stride: int = 1) -> Any:
-    """Return a Warp function that sums a value over the threads of a particle; each gets the sum.
+    """Return a Warp function that adds a value over the threads of a particle; each gets the sum.
 
     On a CPU there is one thread. With `whole_warps` all threads of a warp must call it together,
-    which takes fewer instructions. Every `stride`-th thread is summed, a power of two.
+    which takes fewer instructions. Every `stride`-th thread is added, a power of two.
     """
     options = scalar_of(value_type), lanes, whole_warps, stride
     return native.function("lane_sum", *options, value=value_type, returns=value_type)
@@ -129,22 +128,17 @@ thread_number = native.function("thread_number", returns=int)
 """This thread's index in the launch, without the divisions of `wp.tid`."""
 
 block_number = native.function("block_number", returns=int)
-"""This block's index in the launch."""
-
 thread_of_block = native.function("thread_of_block", returns=int)
-"""This thread's index in its block."""
+"""This block's index in the launch, and this thread's index in its block."""
 
-sync_block = native.function("sync_block")
-"""Synchronize the threads of the block, and make their writes visible to each other."""
-
-sync_warp = native.function("sync_warp")
-"""Synchronize the threads of the warp, and make their writes visible to each other."""
+sync_block, sync_warp = native.function("sync_block"), native.function("sync_warp")
+"""Synchronize the threads of the block or warp, and make their writes visible to each other."""
 
 any_in_warp = native.function("any_in_warp", condition=bool, returns=bool)
 """Whether a condition is true for some thread of the warp."""
 
 first_in_warp = native.function("first_in_warp", condition=bool, returns=int)
-"""The first thread for which a condition is true, -1 for none."""
+"""The number in the warp of the first thread for which a condition is true, -1 for none."""
 
 vote_of_warp = native.function("vote_of_warp", condition=bool, returns=wp.uint32)
 """A number with a bit for each thread of the warp: whether a condition is true."""
@@ -156,10 +150,8 @@ sum_up_to = native.function("sum_up_to", value=int, returns=int)
 """The sum of the values of this thread and of those before it in the warp."""
 
 thread_of = native.function("thread_of", ends=int, number=int, returns=int)
-"""The first thread of the warp whose `ends` is above `number`; `ends` must ascend."""
+"""The number of the first thread of the warp whose `ends` exceeds `number`; `ends` ascend."""
 
 as_number = native.function("as_number", word=float, returns=int)
-"""The integer whose bits are those of a float32."""
-
 as_word = native.function("as_word", number=int, returns=float)
-"""The float32 whose bits are those of an integer."""
+"""The int32 with the bits of a float32, and the float32 with the bits of an int32."""

@@ -1,4 +1,4 @@
-// Backward pass of perception: a warp sums for a tile of eight particles, for cuda/adjoint.py.
+// For cuda/adjoint.py: backward pass of perception; a warp sums for a tile of eight particles.
 //
 // The rows that may be near these particles are listed in shared memory. For eight rows at a time,
 // each thread computes the weights of two rows for one particle; weights [particles, rows] times

@@ -1,6 +1,6 @@
-"""The adjoint of perception for states on CUDA in float32, by tiles of particles.
+"""Backward pass of perception, for states, on CUDA in float32, by tiles of particles.
 
-The same sums as the portable `gather_state_cotangents`, in another order of work. A warp serves
+The sums are those of the portable `gather_state_cotangents`, in another order. A warp serves
 eight consecutive particles of the sorted order: it lists the rows within eps of their bounding box,
 and multiplies the rows' cotangents by the weights of all eight on tensor cores. So a row's
 cotangents are read once for eight particles.
@@ -13,7 +13,7 @@ from typing import Any
 import warp as wp
 
 from npa_envs.kernels import native_functions as native
-from npa_envs.kernels.domain import SLACK, TERMS_PER_SUM, domain_types, kernel_module
+from npa_envs.kernels.domain import SLACK, TERMS_PER_SUM, group_types, kernel_module
 from npa_envs.kernels.primitives import (
     CUDA_BLOCK,
     WARP,
@@ -41,23 +41,19 @@ TILE_PARTICLES = 8
 LIST_ENTRIES = 96
 """Rows of a full list; more rows are summed in several rounds."""
 
-ENTRY = wp.types.vector(4, wp.float32)
-"""A listed row: its position, and last the index of its channels."""
+ENTRY = FOUR_CHANNELS = wp.types.vector(4, wp.float32)
+"""A listed row: the position of its particle, last the index of its channels; or four channels."""
 
-CHANNELS = wp.types.vector(4, wp.float32)
-"""Four adjacent channels."""
-
-CUDA_REGISTERS = 64
-"""Registers per thread in the gathering of state cotangents."""
+STATE_REGISTERS = 64
+"""Registers per thread of `gather_state_cotangents`."""
 
 THREAD_CHANNELS = 4
-"""Channels of a row that one thread unscales."""
+"""Adjacent channels of a row whose gradients one thread of `unscale_cotangents` computes."""
 
 MAX_LENGTH = 3.4028234663852886e38
 """The largest float32, a bound on any coordinate [length units]."""
 
-load_channels = make_wide_load(CHANNELS)
-
+load_channels = make_wide_load(FOUR_CHANNELS)
 
 row_list_address = native.function(
     "row_list_address", CUDA_BLOCK // WARP, LIST_ENTRIES, returns=wp.uint32
@@ -67,7 +63,7 @@ row_list_address = native.function(
 
 @cached_under_lock()
 def make_read_columns(count: int) -> Any:
-    """Return a Warp function that reads `count` adjacent numbers of a row, 0 from `end` on."""
+    """Return a Warp function that reads `count` adjacent columns of a row; 0 from `end` on."""
     place = {"values": wp.array2d[wp.float32], "row": int, "column": int, "end": int}
     result_type = wp.types.vector(count, wp.float32)
     return native.function("read_columns", count, **place, returns=result_type)
@@ -92,23 +88,21 @@ keep_unsummed = native.function("keep_unsummed", untyped="address summed_count c
 prefetch_columns = native.function("prefetch_columns", untyped="values row column")
 """Load the memory at a row and column of a matrix into the L2 cache, for a later read."""
 
-regroup_tile = native.function("regroup_tile", total=CHANNELS, returns=CHANNELS)
+regroup_tile = native.function("regroup_tile", total=FOUR_CHANNELS, returns=FOUR_CHANNELS)
 """Exchange sums between threads: from two channels of two particles to four channels of one."""
 
 smallest_in_tile = native.function("smallest_in_tile", value=float, returns=float)
 """The smallest value among a warp's 8 particles, each of which has four threads."""
 
 
-def row_search(space_dim: int, periodic: bool) -> SimpleNamespace:
-    """Return the functions that list the runs of cells around 8 particles and test their rows."""
-    scalar = wp.float32
-    space = domain_types(space_dim, scalar)
-    vector, Domain = space.vector, space.Domain
-    cell_vector = wp.types.vector(space_dim, wp.int32)
+def row_search(space: SimpleNamespace, periodic: bool) -> SimpleNamespace:
+    """Return the functions that find rows near 8 particles: by runs of cells, then by distance."""
+    space_dim, scalar, Domain = space.space_dim, space.scalar, space.Domain
+    vector, cell_vector = space.vector, space.cell_vector
 
     @wp.func
     def line_of(domain: Domain, cell: cell_vector):
-        """Return the index of the line of cells along the first axis that contains a cell."""
+        """Return the index of the line of cells, along the first axis, that contains a cell."""
         line = cell[1]
         if wp.static(space_dim == 3):
             line += cell[wp.static(space_dim - 1)] * domain.cell_shape[1]
@@ -118,8 +112,8 @@ def row_search(space_dim: int, periodic: bool) -> SimpleNamespace:
     def run_cells(domain: Domain, line: int, begin: int, end: int, run: int):
         """Return the first and last + 1 cell (row-major index) of run number `run` around `line`.
 
-        A line is a row of cells along x. Of each line within eps of `line` the columns `begin` to
-        before `end` are one run of adjacent cells, or two if they wrap around the grid.
+        A line is a row of cells along x. Columns `begin` to before `end` of each line within eps of
+        `line` are one run of adjacent cells, or two runs if they wrap around the grid.
         """
         nx = domain.cell_shape[0]
         first = begin
@@ -157,7 +151,7 @@ def row_search(space_dim: int, periodic: bool) -> SimpleNamespace:
 
     @wp.func
     def count_runs(domain: Domain, to_column: int):
-        """Return how many runs `run_cells` has around a line, for columns up to `to_column`."""
+        """Return the number of runs that `run_cells` has around a line, up to `to_column`."""
         runs = space.cells_around(domain, 1)
         if wp.static(space_dim == 3):
             runs *= space.cells_around(domain, wp.static(space_dim - 1))
@@ -165,7 +159,7 @@ def row_search(space_dim: int, periodic: bool) -> SimpleNamespace:
 
     @wp.func
     def box_around(domain: Domain, position: vector, origin: vector, served: bool):
-        """Return centre (from `origin`) and half sides of a box around `served` particles."""
+        """Return centre (from `origin`) and half sides of the box around `served` particles."""
         relative = position - origin
         if wp.static(periodic):
             relative = space.periodic_image(domain, relative)
@@ -180,7 +174,7 @@ def row_search(space_dim: int, periodic: bool) -> SimpleNamespace:
 
     @wp.func
     def near_box(domain: Domain, offset: vector, half: vector):
-        """Return whether a point is within eps of a box, of half sides `half`, by its offset."""
+        """Return whether a point is within eps of a box; `offset`: from its centre."""
         nearest = offset
         if wp.static(periodic):
             nearest = space.periodic_image(domain, nearest)
@@ -192,7 +186,7 @@ def row_search(space_dim: int, periodic: bool) -> SimpleNamespace:
 
     @wp.func
     def row_entry(position: vector, number: int):
-        """Return a list entry of a row: its particle's position, the index of its cotangents."""
+        """Return a row's list entry: its particle's position, and `number`, its first index."""
         entry = ENTRY()
         for d in range(wp.static(space_dim)):
             entry[d] = position[d]
@@ -209,7 +203,6 @@ def row_search(space_dim: int, periodic: bool) -> SimpleNamespace:
 
     @wp.func
     def is_finite(position: vector):
-        """Return whether all coordinates are finite."""
         finite = wp.bool(True)
         for d in range(wp.static(space_dim)):
             finite = finite and wp.isfinite(position[d])
@@ -222,40 +215,31 @@ def row_search(space_dim: int, periodic: bool) -> SimpleNamespace:
 def listed_adjoint(
     space_dim: int, width: int, state_gradient: bool, periodic: bool, grouped: bool
 ) -> SimpleNamespace:
-    """Return the kernels that compute cotangents of states from those of perception.
+    """Return the backward kernels of perception that compute dL/d(states), by name.
 
-    `periodic`: in a box, else in open space. `grouped`: with several groups of `width` channels.
-    The cotangents of a row and group are contiguous, [1 + D, width]: of the smoothed state, then of
-    the state gradient. Zeros follow those of the last row.
+    They are for a box if `periodic`, else for open space, and for several groups of `width`
+    channels if `grouped`. The gradients by perception of a row and group are contiguous, [1 + D,
+    width]: of the smoothed state, then of the state gradient. Zeros follow those of the last row.
     """
-    scalar = wp.float32
-    space = domain_types(space_dim, scalar)
-    vector, Domain = space.vector, space.Domain
-    thread_gradient = wp.types.matrix((space_dim, THREAD_CHANNELS), scalar)
-    weight_count = 1 + space_dim if state_gradient else 1
     options = {"gradient": state_gradient, "periodic": periodic, "grouped": grouped}
-    module = kernel_module("listed_adjoint", space_dim, scalar, width=width, **options)
-    load_vector = make_wide_load(vector)
-    search = row_search(space_dim, periodic)
-    parts = width // THREAD_CHANNELS
-    # Of a warp's 8 particles: the sum of the listed rows' cotangents, weighted by kernels.
-    sum_listed = native.function(
-        "sum_listed",
-        *(space_dim, width, weight_count, periodic),
-        address=wp.uint32,
-        count=int,
-        domain=Domain,
-        position=vector,
-        channels=wp.array[scalar],
-        value=CHANNELS,
-        returns=CHANNELS,
+    module = kernel_module("listed_adjoint", space_dim, wp.float32, width=width, **options)
+    space = group_types(space_dim, wp.float32, width)
+    return SimpleNamespace(
+        unscale_cotangents=unscaling_kernel(space, module, state_gradient),
+        gather_state_cotangents=state_kernel(space, module, state_gradient, periodic, grouped),
     )
-    log_scale_cotangent = native.function(
-        "log_scale_cotangent", scaled=vector, cotangent=vector, returns=vector
-    )
+
+
+def unscaling_kernel(space: SimpleNamespace, module: wp.Module, state_gradient: bool) -> wp.Kernel:
+    """Return the kernel that pulls gradients back through the logarithmic scaling."""
+    space_dim, scalar, vector = space.space_dim, space.scalar, space.vector
+    weight_count, parts = 1 + space_dim * state_gradient, space.width // THREAD_CHANNELS
+    thread_gradient = wp.types.matrix((space_dim, THREAD_CHANNELS), scalar)
+    vectors = {"scaled": vector, "cotangent": vector}
+    log_scale_cotangent = native.function("log_scale_cotangent", **vectors, returns=vector)
     read_gradients = make_read_columns(THREAD_CHANNELS * space_dim)
 
-    @wp.kernel(enable_backward=False, module=module, grid_stride=False)
+    @wp.kernel(module=module, grid_stride=False)
     def unscale_cotangents(
         state_dim: int,
         gradient_scale: scalar,
@@ -267,9 +251,9 @@ def listed_adjoint(
         perception: wp.array2d[scalar],
         perception_bar: wp.array2d[scalar],
         # outputs
-        cotangents: wp.array[CHANNELS],
+        cotangents: wp.array[FOUR_CHANNELS],
     ):
-        """Write dL/d(smoothed states) times `smoothed_scale`, dL/d(gradients before scaling)."""
+        """Write dL/d(smoothed states) times `smoothed_scale`, and dL/d(state gradients)."""
         wait_for_previous_kernel()
         allow_next_launch()
         thread = wp.tid()
@@ -281,7 +265,7 @@ def listed_adjoint(
         index = entry * wp.static(weight_count * parts) + part % wp.static(parts)
         if row == row_capacity and part < wp.static(parts):
             for n in range(wp.static(weight_count)):
-                wide_store(cotangents, index + n * wp.static(parts), CHANNELS())
+                wide_store(cotangents, index + n * wp.static(parts), FOUR_CHANNELS())
         if row < wp.min(load_integer(starts, starts.shape[0] - 1) - row_base, row_capacity):
             column = state_dim + channel
             smoothed = read_channels(perception_bar, row, column, 2 * state_dim)
@@ -304,11 +288,25 @@ def listed_adjoint(
                 for d in range(wp.static(space_dim)):
                     wide_store(cotangents, index + (d + 1) * wp.static(parts), gradient_bars[d])
 
-    @wp.kernel(
-        enable_backward=False, module=module, cuda_max_registers=CUDA_REGISTERS, grid_stride=False
-    )
+    return unscale_cotangents
+
+
+def state_kernel(
+    space: SimpleNamespace, module: wp.Module, state_gradient: bool, periodic: bool, grouped: bool
+) -> wp.Kernel:
+    """Return the kernel that computes dL/d(states) from the result of `unscale_cotangents`."""
+    space_dim, scalar, width, vector = space.space_dim, space.scalar, space.width, space.vector
+    weight_count, parts = 1 + space_dim * state_gradient, width // THREAD_CHANNELS
+    load_vector, search = make_wide_load(vector), row_search(space, periodic)
+    # Of a warp's 8 particles: the sum of the listed rows' cotangents, weighted by kernels.
+    rows = {"address": wp.uint32, "count": int, "domain": space.Domain, "position": vector}
+    values = {"channels": wp.array[scalar], "value": FOUR_CHANNELS}
+    sizes = space_dim, width, weight_count, periodic
+    sum_listed = native.function("sum_listed", *sizes, **rows, **values, returns=FOUR_CHANNELS)
+
+    @wp.kernel(module=module, cuda_max_registers=STATE_REGISTERS, grid_stride=False)
     def gather_state_cotangents(
-        domain: Domain,
+        domain: space.Domain,
         norm: scalar,
         particle_count: int,
         tile_count: int,
@@ -324,12 +322,12 @@ def listed_adjoint(
         row_positions: wp.array[vector],
         row_kernel_sum: wp.array[vector],
         perception_bar: wp.array2d[scalar],
-        cotangents: wp.array[CHANNELS],
+        cotangents: wp.array[FOUR_CHANNELS],
         flat_cotangents: wp.array[scalar],
         # outputs
         states_bar: wp.array2d[scalar],
     ):
-        """Write the cotangent of each particle's state, summed over the active particles around it.
+        """Write dL/d(state) of each particle, a sum over the active particles around it.
 
         A world's particles are `tile_count` tiles of 8; a warp serves a tile and a group of
         channels. `norm` is the normalising constant of the kernels, which multiplies the sum.
@@ -360,7 +358,7 @@ def listed_adjoint(
         cell = space.cell_of(domain, position)
         line = search.line_of(domain, cell)
         address = row_list_address()
-        total = CHANNELS()
+        total = FOUR_CHANNELS()
         # A position that is not finite has no neighbours.
         waiting = k < end and search.is_finite(position)
         while any_in_warp(waiting):
@@ -380,7 +378,7 @@ def listed_adjoint(
             votes = vote_of_warp(served) >> wp.uint32(8 * (lane & 3))
             count = wp.int32(0)
             block = wp.int32(0)
-            block_sums = CHANNELS()
+            block_sums = FOUR_CHANNELS()
             for first_run in range(0, run_count, wp.static(WARP)):
                 run = first_run + lane
                 run_begin = wp.int32(0)
@@ -414,12 +412,7 @@ def listed_adjoint(
                             nothing = search.row_entry(origin, row_capacity * group_count)
                             summed_count = pad_list(address, count, nothing)
                         block_sums = sum_listed(
-                            address,
-                            summed_count,
-                            domain,
-                            position,
-                            flat_cotangents,
-                            block_sums,
+                            address, summed_count, domain, position, flat_cotangents, block_sums
                         )
                         keep_unsummed(address, summed_count, count)
                         count = wp.max(count - summed_count, 0)
@@ -429,7 +422,7 @@ def listed_adjoint(
                                 if (votes & wp.uint32(1 << (4 * n))) != wp.uint32(0):
                                     total[n] += block_sums[n]
                                     total[n + 2] += block_sums[n + 2]
-                            block_sums = CHANNELS()
+                            block_sums = FOUR_CHANNELS()
                             block = wp.int32(0)
         total = regroup_tile(total)
         if written < end and part < wp.static(parts) and channel < state_dim:
@@ -446,6 +439,4 @@ def listed_adjoint(
                         )
             write_columns(states_bar, i, channel, bar)
 
-    return SimpleNamespace(
-        unscale_cotangents=unscale_cotangents, gather_state_cotangents=gather_state_cotangents
-    )
+    return gather_state_cotangents

@@ -1,4 +1,4 @@
-// Density of particles, a warp for each tile of consecutive ones, for cuda/density.py.
+// For cuda/density.py: densities and neighbour lists; a warp serves a tile of eight particles.
 
 namespace npa {
 

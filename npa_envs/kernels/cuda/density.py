@@ -3,16 +3,15 @@
 `listed_density`: one thread finds a particle's neighbours with far fewer instructions than several,
 which would have to agree on positions in the list. A list has the differences of sorted indices
 from the particle to its neighbours, in 16 bits. It is made in shared memory and written to an array
-in which the lists of 32 particles are interleaved, two entries at a time. Of a list beyond the
-capacity only the length is written.
+in which the lists of 32 particles are interleaved, two entries at a time.
 
 `tiled_density`, for small worlds in 2D: a warp serves a tile of eight consecutive particles, whose
 lists are stored one after the other. They are in one or two lines of cells, so most candidates are
-the same, and the warp copies these into shared memory once. Each of a particle's four lanes tests
-every fourth candidate: ten instructions, without addresses or ends of runs. It stores the results
-as bits, from which lists are made afterwards. That halves the time for few particles with many
-neighbours. In sparse worlds tiles share few candidates, and worlds that fill a GPU need only a
-thread for each particle. Worlds have at most 2^15 particles: entries of lists have 16 bits.
+the same, and the warp copies these into shared memory once. Each of a particle's four lanes (the
+threads that share it) tests every fourth candidate: ten instructions, without addresses or ends of
+runs. It stores the results as bits, from which lists are made afterwards. That halves the time for
+few particles with many neighbours. In sparse worlds tiles share few candidates, and worlds that
+fill a GPU need only a thread for each particle. Worlds have at most 2^15 particles.
 """
 
 import warp as wp
@@ -33,22 +32,23 @@ from npa_envs.kernels.primitives import (
 from npa_envs.thread_lock import cached_under_lock
 
 AHEAD, SHARED_AHEAD = 6, 5
-"""Candidates that a thread loads at a time, if a particle has one lane, and if it has several."""
+"""Candidates that a thread loads at a time: if a particle has one thread, and if it has several."""
 
 LIST_BLOCK = 64
 """Threads of a block: few, as their lists have to fit into shared memory."""
 
-CUDA_REGISTERS = 80
-"""Registers per thread; by default the compiler takes half as many and issues loads one by one."""
+LIST_REGISTERS, TILE_REGISTERS = 80, 64
+"""Registers per thread of `listed_density` (with the default, half as many, loads come singly) and
+of `tiled_density`, for 32 warps on a multiprocessor."""
 
 RECORD = wp.types.vector(4, wp.float32)
 """A neighbour's data for perception: position, volume, and in 2D the index of its state."""
 
 MAX_STEP = wp.constant(2**15 - 1)
-"""Largest step of a list: entries have 16 bits."""
+"""Largest difference of sorted indices in a list: its entries have 16 bits."""
 
 SHARE_OF_LIST = 2
-"""Room of each of several lanes, as a multiple of an equal part of a list."""
+"""Room for the entries of each of several lanes, as a multiple of an equal part of a list."""
 
 LIST_END = wp.types.vector(2, wp.uint32)
 """Address of a list's next entry, and the distance [bytes] from it to the one after."""
@@ -59,9 +59,6 @@ TILE_PARTICLES, TILE_LANES, MIN_SIDE = native.constants(
 """Particles of a tile, lanes of a warp that share one, and cells along each side of the smallest
 periodic box that is divided into tiles."""
 
-TILE_REGISTERS = 64
-"""Registers per thread, so that a multiprocessor runs 32 warps."""
-
 
 @cached_under_lock()
 def listed_density(
@@ -69,8 +66,8 @@ def listed_density(
 ) -> wp.Kernel:
     """Return the kernel that computes densities and lists neighbours, `lanes` threads per particle.
 
-    `capacity`: longest list. `masked`: only active particles get lists. With several lanes,
-    launches have complete warps, whose threads write lists together.
+    `capacity` is the maximum length of a list. If `masked`, only active particles get lists. With
+    several lanes, launches have complete warps, whose threads write lists together.
     """
     scalar = wp.float32
     flat = space_dim == 2
@@ -108,10 +105,10 @@ def listed_density(
 
     @wp.func
     def cells_beyond(within_cell: vector, line: int):
-        """Return how many cells at the beginning, and at the end, of a line of five are beyond eps.
+        """Return the numbers of cells beyond eps at the beginning and at the end of a line of five.
 
-        The five lines around a particle are numbered from 0; its own is 2. `within_cell` is its
-        position in its cell, in units of a cell.
+        The five lines around a particle have numbers 0 to 4; the particle is in line 2.
+        `within_cell` is its position in its cell, in units of a cell.
         """
         across = wp.where(
             line < 2, within_cell[1] + scalar(1 - line), scalar(line - 2) - within_cell[1]
@@ -123,13 +120,9 @@ def listed_density(
         return wp.max(first + 2, 0), wp.max(2 - last, 0)
 
     options = {"lanes": lanes, "periodic": periodic, "capacity": capacity, "masked": masked}
+    module = kernel_module("listed_density", space_dim, scalar, **options)
 
-    @wp.kernel(
-        enable_backward=False,
-        module=kernel_module("listed_density", space_dim, scalar, **options),
-        cuda_max_registers=CUDA_REGISTERS,
-        grid_stride=False,
-    )
+    @wp.kernel(module=module, cuda_max_registers=LIST_REGISTERS, grid_stride=False)
     def compute_density(
         domain: Domain,
         starts: wp.array[wp.int32],
@@ -144,10 +137,10 @@ def listed_density(
         lists: wp.array3d[wp.int16],
         list_lengths: wp.array[wp.int32],
     ):
-        """Write positions with volumes 1 / rho, and neighbour lists of active particles.
+        """Write each particle's position and volume 1 / ρ, and neighbour lists of active ones.
 
-        They go to `records`, in 2D with the index of the particle's state, and to `particles`
-        unless it is empty. Of a list longer than the capacity only the length is written.
+        Positions and volumes go to `records`, in 2D with the index of the particle's state, and to
+        `particles` unless it is empty. Of a list beyond the capacity only the length is written.
         """
         wait_for_previous_kernel()
         thread = wp.tid()
@@ -251,37 +244,22 @@ def listed_density(
 def tiled_density(periodic: bool, capacity: int, masked: bool) -> wp.Kernel:
     """Return the kernel that computes densities and lists neighbours in 2D, a warp for 8 particles.
 
-    `capacity`: longest list. `masked`: only active particles get lists.
+    `capacity` is the maximum length of a list. If `masked`, only active particles get lists.
     """
     space = domain_types(2, wp.float32)
     vector, particle, Domain = space.vector, space.particle, space.Domain
-    load_vector = make_wide_load(vector)
-
+    load_vector, integers = make_wide_load(vector), wp.array[wp.int32]
+    cells = {"starts": integers, "sorted_cell": integers, "sorted_positions": wp.array[vector]}
+    place = {"base": int, "first": int, "k": int, "inside": bool, "row": int}
+    arguments = {"domain": Domain, **cells, **place, "lists": wp.array3d[wp.int16]}
+    arguments["list_lengths"] = integers
     density_of_tile = native.function(
-        "density_of_tile",
-        *(capacity, periodic),
-        domain=Domain,
-        starts=wp.array[wp.int32],
-        sorted_cell=wp.array[wp.int32],
-        sorted_positions=wp.array[vector],
-        base=int,
-        first=int,
-        k=int,
-        inside=bool,
-        row=int,
-        lists=wp.array3d[wp.int16],
-        list_lengths=wp.array[wp.int32],
-        returns=float,
+        "density_of_tile", capacity, periodic, **arguments, returns=float
     )
-
     options = {"periodic": periodic, "capacity": capacity, "masked": masked}
+    module = kernel_module("tiled_density", 2, wp.float32, **options)
 
-    @wp.kernel(
-        enable_backward=False,
-        module=kernel_module("tiled_density", 2, wp.float32, **options),
-        cuda_max_registers=TILE_REGISTERS,
-        grid_stride=False,
-    )
+    @wp.kernel(module=module, cuda_max_registers=TILE_REGISTERS, grid_stride=False)
     def compute_density(
         domain: Domain,
         particle_count: int,
@@ -297,7 +275,7 @@ def tiled_density(periodic: bool, capacity: int, masked: bool) -> wp.Kernel:
         lists: wp.array3d[wp.int16],
         list_lengths: wp.array[wp.int32],
     ):
-        """Write what the kernel of `listed_density` writes, but lists one after the other."""
+        """Write what the kernel of `listed_density` writes; each list is contiguous."""
         wait_for_previous_kernel()
         thread = thread_number()
         tile = thread >> wp.static(WARP.bit_length() - 1)

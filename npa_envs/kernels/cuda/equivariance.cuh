@@ -1,4 +1,4 @@
-// Vectors of equivariant rules, and their gradients, a warp for a few rows: cuda/equivariance.py.
+// For cuda/equivariance.py: vectors of equivariant rules, and their gradients; a warp serves a few rows.
 // Names: `x_bar` = dL/dx, the gradient of the loss L with respect to x.
 
 namespace npa {

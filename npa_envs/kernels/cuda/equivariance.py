@@ -18,24 +18,24 @@ READ_WARPS, PULL_WARPS, STEER_WARPS, MIXING_SUM_WARPS = 4, 4, 4, 16
 """Warps of a block of `read_rows`, `pull_back_rows`, the steering kernels and `add_blocks`."""
 
 STEERED_ROWS = 2
-"""Rows that a warp steers."""
+"""Rows of outputs from which a warp computes updates."""
 
 MAX_MIXING = 1024
-"""Most mixing weights: each thread sums gradients of every 32nd of them."""
+"""Maximum number of mixing weights: each thread sums gradients of every 32nd of them."""
 
 SHARED_BYTES = 48 * 1024
 """Shared memory of a block that the driver grants by default [bytes]."""
 
 
 def rows_of_warp(mixed_count: int) -> int:
-    """Return how many rows a warp serves: a thread for each of their mixed vectors, at most 4."""
+    """Return the number of rows of a warp, at most 4: a thread for each of their mixed vectors."""
     return min(max(WARP // mixed_count, 1), 4)
 
 
 def fits_block(
     space_dim: int, scalars: int, perceived: int, mixed_count: int, chiral: bool
 ) -> bool:
-    """Return whether `row_kernels` of these sizes exist: rows must fit into shared memory."""
+    """Return whether rows of these sizes fit into a block's shared memory, for `row_kernels`."""
     weights = perceived * mixed_count
     products = mixed_count * (mixed_count + 1) // 2 + chiral * (
         mixed_count * (mixed_count - 1) // 2
@@ -49,11 +49,11 @@ def fits_block(
 def row_kernels(
     space_dim: int, scalars: int, perceived: int, mixed_count: int, chiral: bool
 ) -> SimpleNamespace:
-    """Return the kernels that compute a network's inputs from rows of perception, and the adjoint.
+    """Return the kernel from rows of perception to a network's inputs, and its backward kernel.
 
-    Columns of rows are [scalars | perceived vectors | 1 | 0], of inputs [scalars | products of
-    mixed vectors | 1 | 0]. Mixed vectors [K, mixed_count, D] and mixing weights [perceived,
-    mixed_count] are flat arrays.
+    Columns of rows are [scalars | perceived vectors | 1 | 0], those of inputs are [scalars |
+    products of mixed vectors | 1 | 0]. Mixed vectors [K, mixed_count, D] and mixing weights
+    [perceived, mixed_count] are flat arrays.
     """
     form = space_dim, scalars, perceived, mixed_count, chiral
     module = native.module(f"npa_envs.kernels.vector_rows_{'_'.join(str(int(k)) for k in form)}")
@@ -67,7 +67,7 @@ def row_kernels(
         untyped="rows mixing mixed mixed_bar inputs_bar rows_bar partial_sums",
     )
 
-    @wp.kernel(enable_backward=False, module=module)
+    @wp.kernel(module=module)
     def read_rows(
         rows: wp.array2d[wp.float32],
         mixing: wp.array[wp.float32],
@@ -79,7 +79,7 @@ def row_kernels(
         wait_for_previous_kernel()
         read_vectors(rows, mixing, mixed, inputs)
 
-    @wp.kernel(enable_backward=False, module=module)
+    @wp.kernel(module=module)
     def pull_back_rows(
         rows: wp.array2d[wp.float32],
         mixing: wp.array[wp.float32],
@@ -90,7 +90,7 @@ def row_kernels(
         rows_bar: wp.array2d[wp.float32],
         partial_sums: wp.array2d[wp.float32],
     ):
-        """Write the cotangents of rows, and each block's sum of those of the mixing weights."""
+        """Write dL/d(rows), and each block's sum of dL/d(mixing weights)."""
         wait_for_previous_kernel()
         pull_back_vectors(rows, mixing, mixed, mixed_bar, inputs_bar, rows_bar, partial_sums)
 
@@ -99,22 +99,19 @@ def row_kernels(
 
 @cached_under_lock()
 def mixing_sum() -> wp.Kernel:
-    """Return the kernel that adds up the blocks' sums of the mixing weights' gradients."""
+    """Return the kernel that adds up the blocks' sums of dL/d(mixing weights)."""
     add_partial_sums = native.function(
         "add_partial_sums", MIXING_SUM_WARPS, untyped="partial_sums total"
     )
+    module = native.module("npa_envs.kernels.vector_sums")
 
-    @wp.kernel(
-        enable_backward=False,
-        module=native.module("npa_envs.kernels.vector_sums"),
-        launch_bounds=MIXING_SUM_WARPS * WARP,
-    )
+    @wp.kernel(module=module, launch_bounds=MIXING_SUM_WARPS * WARP)
     def add_blocks(
         partial_sums: wp.array2d[wp.float32],
         # outputs
         total: wp.array[wp.float32],
     ):
-        """Add up the mixing weights' gradients that the blocks of `pull_back_rows` have written."""
+        """Write dL/d(mixing weights), the sum over the blocks of `pull_back_rows`."""
         wait_for_previous_kernel()
         add_partial_sums(partial_sums, total)
 
@@ -123,10 +120,10 @@ def mixing_sum() -> wp.Kernel:
 
 @cached_under_lock()
 def steering_kernels(space_dim: int, mixed_count: int, chiral: bool) -> SimpleNamespace:
-    """Return the kernels that compute updates from a network's outputs, and the adjoint.
+    """Return the kernel from a network's outputs to updates, and its backward kernel.
 
-    Columns of outputs are [gates | state changes | 0], of updates [displacement | state changes |
-    0]: displacements are mixed vectors, weighted by gates. A warp serves `STEERED_ROWS` rows.
+    Columns of outputs are [gates | state changes | 0], those of updates are [displacement | state
+    changes | 0]. A displacement is a sum of mixed vectors times gates.
     """
     form = space_dim, mixed_count, chiral
     module = native.module(f"npa_envs.kernels.steering_{'_'.join(str(int(k)) for k in form)}")
@@ -136,7 +133,7 @@ def steering_kernels(space_dim: int, mixed_count: int, chiral: bool) -> SimpleNa
         "pull_back_gates", *sizes, untyped="output mixed signs update_bar output_bar mixed_bar"
     )
 
-    @wp.kernel(enable_backward=False, module=module)
+    @wp.kernel(module=module)
     def steer(
         output: wp.array2d[wp.float32],
         mixed: wp.array[wp.float32],
@@ -144,11 +141,11 @@ def steering_kernels(space_dim: int, mixed_count: int, chiral: bool) -> SimpleNa
         # outputs
         update: wp.array2d[wp.float32],
     ):
-        """Write updates from a network's gates and state changes, and from mixed vectors."""
+        """Write updates: displacements, sums of gates times mixed vectors; state changes."""
         wait_for_previous_kernel()
         steer_by_gates(output, mixed, signs, update)
 
-    @wp.kernel(enable_backward=False, module=module)
+    @wp.kernel(module=module)
     def pull_back_steering(
         output: wp.array2d[wp.float32],
         mixed: wp.array[wp.float32],
@@ -158,7 +155,7 @@ def steering_kernels(space_dim: int, mixed_count: int, chiral: bool) -> SimpleNa
         output_bar: wp.array2d[wp.float32],
         mixed_bar: wp.array[wp.float32],
     ):
-        """Write gradients by outputs [g | Δs] and mixed vectors, from those by updates [δ | Δs]."""
+        """Write dL/d(output) and dL/d(mixed vectors) from `update_bar`, dL/d(update)."""
         wait_for_previous_kernel()
         pull_back_gates(output, mixed, signs, update_bar, output_bar, mixed_bar)
 

@@ -1,4 +1,4 @@
-// Neighbour lists, made in shared memory by cuda/density.py and read by cuda/perceive.py.
+// For cuda/density.py and cuda/perceive.py: neighbour lists, made in shared memory, and read.
 
 namespace npa {
 

@@ -1,4 +1,4 @@
-// Two-layer network and gradients of its weights on tensor cores, for kernels of cuda/network.py.
+// For cuda/network.py: a network of two layers, and gradients of its weights, on tensor cores.
 //
 // A float32 number is split: a 16-bit number and the remainder in 16 bits. Of the four products
 // of two such pairs the three larger ones are summed: 22 bits with float16, 16 with bfloat16. Tensor
@@ -212,9 +212,9 @@ __device__ inline void weight_sums(
 
     const unsigned lane = threadIdx.x & 31u, t = lane & 3u, g = lane >> 2;
     const int width = rows.shape[1], out_width = output_bar.shape[1];
-    const int share = blockIdx.x / UNIT_BLOCKS;
+    const int range = blockIdx.x / UNIT_BLOCKS;
     const int base = ((blockIdx.x % UNIT_BLOCKS) * WARPS + threadIdx.x / 32) * 32;
-    const int begin = share * part_rows, end = min(begin + part_rows, rows.shape[0]);
+    const int begin = range * part_rows, end = min(begin + part_rows, rows.shape[0]);
 
     // Rows are loaded while the previous ones are summed. A thread splits the numbers it loads.
     const auto ask_for_rows = [&](int first) {
@@ -307,12 +307,12 @@ __device__ inline void weight_sums(
         if (first + ROWS < end) ask_for_rows(first + ROWS);
         #pragma unroll 1
         for (int row = 0; row < ROWS && first + row < end; row += 16) {
-            unsigned kept[2][2];
+            unsigned masks[2][2];
             #pragma unroll
             for (int i = 0; i < 4; ++i) {
                 const int at = first + row + 8 * (i / 2) + 2 * t + i % 2;
                 const int word = at < end ? signs[(size_t)at * WORDS] : 0;
-                kept[i / 2][i % 2] = (unsigned)word >> (base % 128 / 4 + (g & 1u));
+                masks[i / 2][i % 2] = (unsigned)word >> (base % 128 / 4 + (g & 1u));
             }
             float sum[2][2][4] = {}, bar[2][2][4] = {};
             #pragma unroll
@@ -341,7 +341,7 @@ __device__ inline void weight_sums(
                         float unit[2], unit_bar[2];
                         #pragma unroll
                         for (int i = 0; i < 2; ++i) {
-                            const bool on = kept[tile][i] >> (4 * group + 2 * half) & 1u;
+                            const bool on = masks[tile][i] >> (4 * group + 2 * half) & 1u;
                             unit[i] = on ? sum[group][tile][2 * half + i] : 0.0f;
                             unit_bar[i] = on ? bar[group][tile][2 * half + i] : 0.0f;
                         }
@@ -385,7 +385,7 @@ __device__ inline void weight_sums(
         }
     }
 
-    float* to = partial_sums.data + (size_t)share * partial_sums.shape[1];
+    float* to = partial_sums.data + (size_t)range * partial_sums.shape[1];
     #pragma unroll
     for (int group = 0; group < 2; ++group) {
         #pragma unroll
@@ -418,7 +418,7 @@ __device__ inline void add_partial_sums(
     if (column < width) {
         const float* from = partial_sums.data + column;
         #pragma unroll 8
-        for (int share = warp; share < count; share += WARPS) sum += from[(size_t)share * width];
+        for (int range = warp; range < count; range += WARPS) sum += from[(size_t)range * width];
     }
     sums[warp][threadIdx.x % 32] = sum;
     __syncthreads();

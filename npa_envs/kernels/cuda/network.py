@@ -21,14 +21,9 @@ ROW_TARGET, UNIT_TARGET, OUTPUT_TARGET = 8, 4, 7
 
 A hidden unit is then below 2^(8 + 1 + 4 + 1), in the range of float16, with a far smaller error."""
 
-ROW_TILE = 32
-"""Rows of a block's weight gradients between two barriers."""
-
-WARP_UNITS = 32
-"""Hidden units whose weight gradients one warp sums."""
-
-SUM_WARPS = 4
-"""Warps of a block that adds partial sums."""
+ROW_TILE, WARP_UNITS, SUM_WARPS = 32, 32, 4
+"""Of weight gradients: rows that a block sums between two barriers, hidden units of one warp, and
+warps of a block that adds partial sums."""
 
 LAYER_REGISTERS, GRADIENT_REGISTERS = 168, 255
 """Registers per thread of the layer kernels and of the weight gradient kernels."""
@@ -41,14 +36,15 @@ WIDE, WIDE_REGISTERS = range(81, 97), 128
 def two_layer_kernel(steps: int, tiles: int, mode: str) -> wp.Kernel:
     """Return the kernel that applies a network of two layers to rows; a warp serves 16 rows.
 
-    Rows have at most 16 `steps` columns, outputs at most 8 `tiles`. `mode` "relu" applies ReLU
-    to hidden units, "relu_store_mask" also stores its mask, and "apply_mask" applies a stored one.
+    Rows have at most 16 `steps` columns, outputs at most 8 `tiles`. `mode` "relu" applies ReLU to
+    hidden units, "relu_store_mask" also stores its mask, "apply_mask" applies a stored mask
+    instead.
 
     Arguments: number of hidden units H, a multiple of 16; rows [K, width]; weights of both layers,
-    from `arrange_hidden` and `arrange_output`; scales of the outputs [8 `tiles`]; masks of ReLU, a
-    bit for each hidden unit, [K, 4 ceil(H / 128)]; outputs [K, out_width]. All are dimensionless.
-    Rows are read 16 bytes at a time and outputs written 8 at a time: both must be dense, begin at a
-    multiple of that and have a multiple of 4, or 2, columns. Weights begin at 16 bytes, too.
+    from `arrange_hidden` and `arrange_output`; scales of the outputs [8 `tiles`]; `signs`, the
+    mask, a bit for each hidden unit, [K, 4 ceil(H / 128)]; outputs [K, out_width]. Rows are read 16
+    bytes at a time and outputs written 8 at a time: both must be dense, begin at a multiple of that
+    and have a multiple of 4, or 2, columns. Weights begin at a multiple of 16 bytes, too.
     """
     name = f"npa_envs.kernels.network_{mode}_{steps}_{tiles}"
     registers = WIDE_REGISTERS if max(16 * steps, 8 * tiles) in WIDE else LAYER_REGISTERS
@@ -59,7 +55,7 @@ def two_layer_kernel(steps: int, tiles: int, mode: str) -> wp.Kernel:
         untyped="unit_count rows hidden_weights output_weights output_unscale signs output",
     )
 
-    @wp.kernel(enable_backward=False, module=native.module(name), cuda_max_registers=registers)
+    @wp.kernel(module=native.module(name), cuda_max_registers=registers)
     def network_layers(
         unit_count: int,
         rows: wp.array2d[wp.float32],
@@ -81,13 +77,13 @@ def two_layer_kernel(steps: int, tiles: int, mode: str) -> wp.Kernel:
 def weight_gradient_kernels(
     steps: int, tiles: int, out_tiles: int, warps: int, unit_blocks: int, words: int
 ) -> SimpleNamespace:
-    """Return the kernels of both layers' weight gradients: sums over ranges of rows, and their sum.
+    """Return two kernels: both layers' weight gradients, summed over ranges of rows; their total.
 
-    Rows have 16 `steps` or 8 `tiles` columns, output cotangents 8 `out_tiles`, masks `words` words.
-    A block sums a range of rows for 1 / `unit_blocks` of the hidden units, each of its `warps` for
-    `WARP_UNITS`. It recomputes hidden values and cotangents, transposed, as left operands of the
-    gradients' products. Numbers are pairs of bfloat16, which need no scaling: scales differ among
-    rows, and sums run over rows.
+    Rows have 16 `steps` or 8 `tiles` columns, gradients by outputs 8 `out_tiles`, masks `words`
+    words. A block sums a range of rows for 1 / `unit_blocks` of the hidden units, each of its
+    `warps` for `WARP_UNITS`. It recomputes hidden units and gradients by them, transposed, as left
+    operands of the weight gradients' products. Numbers are pairs of bfloat16, which need no
+    scaling: scales differ among rows, and sums run over rows.
     """
     variant = f"{steps}_{tiles}_{out_tiles}_{warps}_{unit_blocks}_{words}"
     module = native.module(f"npa_envs.kernels.network_gradients_{variant}")
@@ -95,12 +91,11 @@ def weight_gradient_kernels(
     weight_sums = native.function(
         "weight_sums",
         *sizes,
-        untyped="unit_count part_rows rows output_bar signs hidden_weights output_weights "
-        "partial_sums",
+        untyped="unit_count part_rows rows output_bar signs hidden_weights output_weights sums",
     )
     add_partial_sums = native.function("add_partial_sums", SUM_WARPS, untyped="partial_sums total")
 
-    @wp.kernel(enable_backward=False, module=module, cuda_max_registers=GRADIENT_REGISTERS)
+    @wp.kernel(module=module, cuda_max_registers=GRADIENT_REGISTERS)
     def sum_weight_gradients(
         unit_count: int,
         part_rows: int,
@@ -110,23 +105,16 @@ def weight_gradient_kernels(
         hidden_weights: wp.array[wp.bfloat16],
         output_weights: wp.array[wp.bfloat16],
         # outputs
-        partial_sums: wp.array2d[wp.float32],
+        sums: wp.array2d[wp.float32],
     ):
         """Write both layers' weight gradients, summed over each range of `part_rows` rows."""
         wait_for_previous_kernel()
         allow_next_launch()
         weight_sums(
-            unit_count,
-            part_rows,
-            rows,
-            output_bar,
-            signs,
-            hidden_weights,
-            output_weights,
-            partial_sums,
+            unit_count, part_rows, rows, output_bar, signs, hidden_weights, output_weights, sums
         )
 
-    @wp.kernel(enable_backward=False, module=module)
+    @wp.kernel(module=module)
     def add_parts(
         partial_sums: wp.array2d[wp.float32],
         # outputs
@@ -148,18 +136,18 @@ scale_to = native.function("scale_to", size=float, exponent=wp.uint32, returns=f
 def arrangement_kernels() -> SimpleNamespace:
     """Return the kernels that lay out weights in the order in which a warp's threads read them.
 
-    Each weight is split into two numbers of 16 bits. The last dimension of launches is 32.
+    Each weight is split into two numbers of 16 bits. The last dimension of launches is a warp, 32.
     """
     module = native.module("npa_envs.kernels.network_arrangement")
 
-    @wp.kernel(enable_backward=False, module=module)
+    @wp.kernel(module=module)
     def arrange_hidden(
         weights: wp.array2d[wp.float32],
         # outputs
         unit_unscale: wp.array[wp.float32],
         fragments: wp.array[wp.float16],
     ):
-        """Scale and lay out a first layer's weights [H, width]: H / 8, ceil(width / 16) warps."""
+        """Scale and arrange layer 1's weights [H, width], with [H / 8, ceil(width / 16)] warps."""
         wait_for_previous_kernel()
         tile, step, lane = wp.tid()
         unit = 8 * tile + lane / 4
@@ -179,7 +167,7 @@ def arrangement_kernels() -> SimpleNamespace:
             fragments[first + i] = high
             fragments[first + 4 + i] = wp.float16(value - wp.float32(high))
 
-    @wp.kernel(enable_backward=False, module=module)
+    @wp.kernel(module=module)
     def arrange_output(
         weights: wp.array2d[wp.float32],
         unit_unscale: wp.array[wp.float32],
@@ -187,7 +175,7 @@ def arrangement_kernels() -> SimpleNamespace:
         output_unscale: wp.array[wp.float32],
         fragments: wp.array[wp.float16],
     ):
-        """Scale and lay out a second layer's weights [width, H]: H / 16, ceil(width / 8) warps."""
+        """Scale and arrange layer 2's weights [width, H], with [H / 16, ceil(width / 8)] warps."""
         wait_for_previous_kernel()
         step, tile, lane = wp.tid()
         column = 8 * tile + lane / 4
@@ -208,13 +196,13 @@ def arrangement_kernels() -> SimpleNamespace:
             fragments[first + i] = high
             fragments[first + 4 + i] = wp.float16(value - wp.float32(high))
 
-    @wp.kernel(enable_backward=False, module=module)
+    @wp.kernel(module=module)
     def arrange_left(
         weights: wp.array2d[wp.float32],
         # outputs
         fragments: wp.array[wp.bfloat16],
     ):
-        """Lay out weights [H, width] as products' left operand: H / 16, ceil(width / 16) warps."""
+        """Arrange weights [H, width] as a left operand, with [H / 16, ceil(width / 16)] warps."""
         wait_for_previous_kernel()
         group, step, lane = wp.tid()
         fragment = (group * ((weights.shape[1] + 15) / 16) + step) * 2 * wp.static(WARP)

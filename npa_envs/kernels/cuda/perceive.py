@@ -1,8 +1,9 @@
 """Perception on CUDA in float32, from the neighbour lists of the density pass.
 
-The same sums as the portable kernel, in another order of work. Threads that share a particle are
-its lanes: one team of `CUDA_LANES`, or several. Their part of shared memory is the particle's slot.
-With neighbours n0, n1, ..., two teams and 16 channels:
+The sums are those of the portable kernel, in another order of work. Some adjacent threads, called
+the particle's lanes, share a particle: one team of `CUDA_LANES` lanes, or several teams. Each
+particle has a part of shared memory, its scratch. With neighbours n0, n1, ..., two teams and 16
+channels:
 
     team  lane   1. writes weights of      2. adds states of   channels
      0     0      n0  n1  n16 n17           n0 n2 n4 ...        0 to 3
@@ -10,11 +11,11 @@ With neighbours n0, n1, ..., two teams and 16 channels:
      ...
      1     7      n14 n15 n30 n31           n1 n3 n5 ...        12 to 15
 
-    slot   | weight, weighted kernel and index of n0 | of n1 | ... | of n31 |
+    scratch | weight, weighted kernel and index of n0 | of n1 | ... | of n31 |
 
-So weights are computed once, only for neighbours, and a neighbour's state is read once, by adjacent
-lanes. Finished rows are also written through the slot, in full transactions. Particles with more
-neighbours than a list has room for search for all of them again.
+So each weight is computed once, only for neighbours, and adjacent lanes read a neighbour's state
+once. Finished rows also go through the scratch, to be written in full transactions. Particles with
+more neighbours than a list has room for search the cells again.
 """
 
 import math
@@ -25,13 +26,12 @@ import warp as wp
 
 from npa_envs.kernels import native_functions as native
 from npa_envs.kernels.cuda.density import RECORD
-from npa_envs.kernels.domain import domain_types, kernel_module
+from npa_envs.kernels.domain import group_types, kernel_module
 from npa_envs.kernels.mathematics import (
     inverse_root,
-    log_scale_of_square,
-    log_scaled_huge,
     make_corrected,
     perception_module_name,
+    scaling_functions,
     smoothing,
     spiky_factor_f64,
     within,
@@ -52,67 +52,67 @@ from npa_envs.kernels.primitives import (
 )
 from npa_envs.thread_lock import cached_under_lock
 
-CUDA_REGISTERS, TEAM_REGISTERS = {2: 80, 3: 112}, 128
-"""Registers per thread: with one team for a particle, by dimension, and with several."""
+PERCEIVE_REGISTERS, TEAM_REGISTERS = {2: 80, 3: 112}, 128
+"""Registers per thread: for one team per particle, by space dimension, and for several teams."""
 
 PAIR = 2
-"""Listed neighbours that a lane processes at a time: their entries are packed in 32 bits."""
+"""Listed neighbours whose weights a lane computes at a time: list entries of 16 bits, in a word."""
 
 TOGETHER = 4
-"""Neighbours whose states are loaded at a time; a divisor of `SLOT_ENTRIES`."""
+"""Neighbours whose states a lane loads at a time; a divisor of `SCRATCH_ENTRIES`."""
 
-SLOT_ENTRIES = 32
-"""Neighbours of a full slot, a multiple of `PAIR` times the lanes; more take several rounds."""
+SCRATCH_ENTRIES = 32
+"""Neighbours of a full scratch, a multiple of `PAIR` times the lanes; more take several rounds."""
 
 CANDIDATES = 16
-"""Candidates of a particle that are loaded at a time in a search."""
+"""Candidates that all lanes of a particle load together in a search."""
 
 load_record = make_wide_load(RECORD)
 
-stage = native.function("stage", untyped="slot word value")
-"""Write a value to a slot, at an offset of 32-bit words."""
+stage = native.function("stage", untyped="scratch word value")
+"""Write a value to the scratch, at an offset `word` in 32-bit words."""
 
 
 class PerceptionVariant(NamedTuple):
-    """Options of the perception kernel; each combination is another kernel."""
+    """Options of the perception kernel; each combination has its own kernel."""
 
     space_dim: int
     width: int
-    """Channels of a group."""
+    """Number of channels in a group."""
     state_gradient: bool
     moment_inverse: str | None
     periodic: bool
     grouped: bool
     """Whether there are several groups of channels."""
     capacity: int
-    """Longest neighbour list."""
+    """Maximum number of neighbours in a list."""
     for_adjoint: bool
-    """Whether the rows' sums of v K are written."""
+    """Whether the backward pass follows: the kernel then also writes each row's sum of v K."""
     teams: int
-    """Teams of `CUDA_LANES` lanes that share a particle, so that few particles fill the GPU: each
-    runs through its own part of the list, for all channels."""
+    """Number of teams of `CUDA_LANES` lanes that share a particle. Several teams let few particles
+    fill the GPU. Each team sums all channels of its own part of the list."""
     per_particle: bool = False
-    """Whether there is a list for each sorted particle, not for each row."""
+    """Whether each sorted particle has a list; if not, each row has one."""
     tiled: bool = False
-    """Whether lists have the layout of `tiled_density`."""
+    """Whether the lists are stored one after the other, as `tiled_density` writes them."""
 
     @property
     def lanes(self) -> int:
-        """Threads that share a particle."""
+        """Number of threads that share a particle."""
         return CUDA_LANES * self.teams
 
     @property
     def lane_width(self) -> int:
-        """Channels that one thread sums, of a group of channels."""
+        """Number of channels that one thread sums."""
         return self.width // CUDA_LANES
 
     @property
     def row_words(self) -> int:
-        """Numbers of a perception row for one group of channels."""
+        """Number of entries of a perception row that one group of channels fills."""
         return self.width * (2 + self.space_dim * self.state_gradient)
 
     def module(self) -> wp.Module:
-        """Return the Warp module of the kernel with these options."""
+        """Return the Warp module for the kernel with these options."""
         options = self._asdict()
         space_dim = options.pop("space_dim")
         gradient = options.pop("state_gradient"), options.pop("moment_inverse")
@@ -120,31 +120,71 @@ class PerceptionVariant(NamedTuple):
         return kernel_module(name, space_dim, wp.float32, **options)
 
 
-def slot_functions(variant: PerceptionVariant, lane_channels: type) -> SimpleNamespace:
-    """Return the functions that access a particle's slot, its part of shared memory, and states."""
-    space_dim, width, lanes = variant.space_dim, variant.width, variant.lanes
-    row_words = variant.row_words
-    vector = wp.types.vector(space_dim, wp.float32)
-    entry_type = wp.types.vector(space_dim + 2, wp.float32)
-    # The additional 16 bytes spread a warp's slots over the banks of shared memory.
-    slot_bytes = max(SLOT_ENTRIES * (16 if space_dim == 2 else 20), 4 * row_words) + 16
+def thread_types(variant: PerceptionVariant) -> SimpleNamespace:
+    """Return `group_types` of the channels that a lane sums, and the structs `Lane` and `Sums`."""
+    space = group_types(variant.space_dim, wp.float32, variant.lane_width)
 
-    slot_address = native.function("slot_address", slot_bytes, lanes, CUDA_BLOCK, returns=wp.uint32)
+    @wp.struct
+    class Lane:
+        """A lane, and its particle: sorted index k, address of the scratch, position.
+
+        `state` has the lane's channels of the particle's state. `first` is the first scratch entry
+        of its team. `states` and `part_count` are arguments of `part_of_state`.
+        """
+
+        k: int
+        lane: int
+        first: int
+        scratch: wp.uint32
+        states: wp.uint64
+        part_count: int
+        state: space.group
+        position: space.vector
+        precise: space.vector_f64
+        inverse_eps: wp.float64
+
+    @wp.struct
+    class Sums:
+        """A lane's sums over neighbours; `kernel` is the sum of v K, volume times spiky kernel.
+
+        `density_gradient` is still to be multiplied by `spiky_norm`.
+        """
+
+        smoothed: space.group
+        gradient: space.group_gradient
+        kernel: space.vector
+        moment: space.square
+        density_gradient: space.vector_f64
+
+    return SimpleNamespace(**vars(space), Lane=Lane, Sums=Sums)
+
+
+def scratch_functions(variant: PerceptionVariant, space: SimpleNamespace) -> SimpleNamespace:
+    """Return all of `space`, plus the functions that access states and a particle's scratch."""
+    space_dim, width, lanes = variant.space_dim, variant.width, variant.lanes
+    row_words, lane_channels, vector = variant.row_words, space.group, space.vector
+    entry_type = wp.types.vector(space_dim + 2, wp.float32)
+    # The additional 16 bytes spread a warp's scratches over the banks of shared memory.
+    scratch_bytes = max(SCRATCH_ENTRIES * (16 if space_dim == 2 else 20), 4 * row_words) + 16
+
+    scratch_address = native.function(
+        "scratch_address", scratch_bytes, lanes, CUDA_BLOCK, returns=wp.uint32
+    )
     part_address = native.function(
         "part_address", states=wp.array[lane_channels], part=int, returns=wp.uint64
     )
     state = {"address": wp.uint64, "part_count": int, "number": int}
     part_of_state = native.function("part_of_state", lane_channels, **state, returns=lane_channels)
-    layout, entry = (space_dim, SLOT_ENTRIES), {"slot": wp.uint32, "entry": int}
-    found = {"slot": wp.uint32, "count": int, "accepted": bool, "number": int}
+    layout, entry = (space_dim, SCRATCH_ENTRIES), {"scratch": wp.uint32, "entry": int}
+    found = {"scratch": wp.uint32, "count": int, "accepted": bool, "number": int}
     append_number = native.function("append_number", *layout, lanes, **found, returns=int)
     number_at = native.function("number_at", *layout, **entry, returns=int)
     weights = {"smooth": float, "kernel": vector, "number": int}
     put_entry = native.function("put_entry", *layout, **entry, **weights)
     entry_at = native.function("entry_at", *layout, **entry, returns=entry_type)
-    sizes = space_dim, width, lanes, row_words, slot_bytes, variant.grouped
+    sizes = space_dim, width, lanes, row_words, scratch_bytes, variant.grouped
     write_rows = native.function(
-        "write_rows", *sizes, untyped="slot destination group state_dim limit rows"
+        "write_rows", *sizes, untyped="scratch destination group state_dim limit rows"
     )
 
     @wp.func
@@ -152,28 +192,15 @@ def slot_functions(variant: PerceptionVariant, lane_channels: type) -> SimpleNam
         """Return a number of neighbours, rounded up to a multiple of the threads of a particle."""
         return (count + wp.static(lanes - 1)) & ~wp.int32(wp.static(lanes - 1))
 
-    return native.namespace(locals())
+    return native.namespace(locals(), **vars(space))
 
 
-def sum_functions(
-    variant: PerceptionVariant, slots: SimpleNamespace, lane_channels: type, lane_gradient: type
-) -> SimpleNamespace:
-    """Return the functions that write neighbours' kernel weights to the slot, and add up sums.
-
-    A lane adds up what has channels for all of its team's neighbours, the rest for its own ones.
-    """
-    scalar = wp.float32
+def weighing_functions(variant: PerceptionVariant, space: SimpleNamespace) -> SimpleNamespace:
+    """Return the functions that write weights to the scratch, and add terms without states."""
     space_dim, lanes, periodic = variant.space_dim, variant.lanes, variant.periodic
-    lane_width, teams = variant.lane_width, variant.teams
-    entries_together = wp.types.matrix((TOGETHER, space_dim + 2), scalar)
-    states_together = wp.types.matrix((TOGETHER, lane_width), scalar)
-    state_gradient, for_adjoint = variant.state_gradient, variant.for_adjoint
-    moment_correction = variant.moment_inverse is not None
-    flat = space_dim == 2
-    space = domain_types(space_dim, scalar)
-    vector, Domain = space.vector, space.Domain
-    vector_f64 = wp.types.vector(space_dim, wp.float64)
-    square = wp.types.matrix((space_dim, space_dim), scalar)
+    state_gradient, moment_correction = variant.state_gradient, variant.moment_inverse is not None
+    scalar, vector, vector_f64 = space.scalar, space.vector, space.vector_f64
+    Domain, Lane, Sums = space.Domain, space.Lane, space.Sums
     indices_of_pair = wp.types.vector(PAIR, wp.int32)
     records_of_pair = wp.types.matrix((PAIR, 4), scalar)
 
@@ -182,40 +209,9 @@ def sum_functions(
     pair_at = native.function("pair_at", variant.capacity, variant.tiled, **place, returns=int)
     entry_of = native.function("entry_of", pair=int, number=int, returns=int)
 
-    @wp.struct
-    class Lane:
-        """A lane and its particle: sorted index k, slot, position, the lane's channels of `state`.
-
-        `states`, `part_count`: arguments of `part_of_state`. `first`: first neighbour of its team.
-        """
-
-        k: int
-        lane: int
-        first: int
-        slot: wp.uint32
-        states: wp.uint64
-        part_count: int
-        state: lane_channels
-        position: vector
-        precise: vector_f64
-        inverse_eps: wp.float64
-
-    @wp.struct
-    class Sums:
-        """A lane's sums over neighbours; `kernel`: of v K, volume times spiky kernel.
-
-        `density_gradient` has no factor `spiky_norm` yet.
-        """
-
-        smoothed: lane_channels
-        gradient: lane_gradient
-        kernel: vector
-        moment: square
-        density_gradient: vector_f64
-
     @wp.func
     def spiky_f64(domain: Domain, own: Lane, neighbour: vector, squared: scalar):
-        """Return a pair's spiky factor f / `spiky_norm` and its offset r, in float64."""
+        """Return f / `spiky_norm` of the spiky kernel f r of a neighbour, and r, in float64."""
         r = vector_f64()
         start = squared
         for d in range(wp.static(space_dim)):
@@ -239,12 +235,12 @@ def sum_functions(
         is_neighbour: bool,
         sums: Sums,
     ):
-        """Write neighbour j's kernel weights to shared memory; add its terms to this thread's sums.
+        """Write neighbour j's kernel weights to a scratch `entry`; return `sums` plus its terms.
 
-        An entry that only pads the list is no neighbour: it repeats the particle, and adds 0.
+        If not `is_neighbour`, the entry only pads the list: it repeats the particle, and adds 0.
         """
         number = j
-        if wp.static(flat):
+        if wp.static(space_dim == 2):
             number = as_number(record[3])
         elif state_index.shape[0] > 0:
             number = load_integer(state_index, j)
@@ -262,13 +258,13 @@ def sum_functions(
         weighted = vector()
         if wp.static(state_gradient):
             weighted = (volume * domain.spiky_norm * scalar(factor)) * offset
-            if wp.static(for_adjoint):
+            if wp.static(variant.for_adjoint):
                 sums.kernel += weighted
             if wp.static(moment_correction):
                 for row in range(wp.static(space_dim)):
                     for column in range(row, wp.static(space_dim)):
                         sums.moment[row, column] += offset[row] * weighted[column]
-        slots.put_entry(own.slot, entry, weight, weighted, number)
+        space.put_entry(own.scratch, entry, weight, weighted, number)
         return sums
 
     @wp.func
@@ -281,15 +277,15 @@ def sum_functions(
         own: Lane,
         sums: Sums,
     ):
-        """Weigh the neighbours `begin` to `count` of those whose indices a search has written."""
+        """Return `sums` plus terms of the neighbours in scratch entries `begin` to `count` - 1."""
         sync_warp()
-        for first in range(own.lane, slots.padded(count), wp.static(PAIR * lanes)):
+        for first in range(own.lane, space.padded(count), wp.static(PAIR * lanes)):
             indices = indices_of_pair()
             loaded = records_of_pair()
             for a in range(wp.static(PAIR)):
                 entry = first + a * wp.static(lanes)
                 listed = entry >= begin and entry < count
-                indices[a] = wp.where(listed, slots.number_at(own.slot, entry), own.k)
+                indices[a] = wp.where(listed, space.number_at(own.scratch, entry), own.k)
             for a in range(wp.static(PAIR)):
                 loaded[a] = load_record(records, indices[a])
             for a in range(wp.static(PAIR)):
@@ -314,11 +310,12 @@ def sum_functions(
         pair: int,
         sums: Sums,
     ):
-        """Weigh a neighbour list's entries from `begin` on, at most `SLOT_ENTRIES` of them.
+        """Write weights of up to `SCRATCH_ENTRIES` neighbours of a list, from number `begin` on.
 
-        `pair` has this lane's next two entries, loaded before the current ones are used.
+        Return the next `pair`, and `sums` plus their terms. `pair` has the next two list entries of
+        the lane, which are loaded before the previous ones are used.
         """
-        end = begin + slots.padded(wp.clamp(length - begin, 0, wp.static(SLOT_ENTRIES)))
+        end = begin + space.padded(wp.clamp(length - begin, 0, wp.static(SCRATCH_ENTRIES)))
         for first in range(begin + wp.static(PAIR) * own.lane, end, wp.static(PAIR * lanes)):
             indices = indices_of_pair()
             loaded = records_of_pair()
@@ -336,19 +333,32 @@ def sum_functions(
         sync_warp()
         return pair, sums
 
+    return native.namespace(locals())
+
+
+def make_add_states(variant: PerceptionVariant, space: SimpleNamespace) -> wp.Function:
+    """Return the function that adds neighbours' states to sums, times their weights in the scratch.
+
+    A lane adds its own channels of all neighbours of its team.
+    """
+    space_dim, lane_width, teams = variant.space_dim, variant.lane_width, variant.teams
+    state_gradient, Lane, Sums = variant.state_gradient, space.Lane, space.Sums
+    entries_together = wp.types.matrix((TOGETHER, space_dim + 2), space.scalar)
+    states_together = wp.types.matrix((TOGETHER, lane_width), space.scalar)
+
     @wp.func
     def add_states(own: Lane, count: int, sums: Sums):
-        """Return `sums` plus weighted states of this team's part of the slot's `count` entries."""
-        for entry in range(own.first, slots.padded(count), wp.static(teams * TOGETHER)):
+        """Return `sums` plus weighted states of the team's part of `count` scratch entries."""
+        for entry in range(own.first, space.padded(count), wp.static(teams * TOGETHER)):
             packed = entries_together()
             loaded = states_together()
             for a in range(wp.static(TOGETHER)):
-                weights = slots.entry_at(own.slot, entry + a * wp.static(teams))
+                weights = space.entry_at(own.scratch, entry + a * wp.static(teams))
                 for n in range(wp.static(space_dim + 2)):
                     packed[a, n] = weights[n]
             for a in range(wp.static(TOGETHER)):
                 number = as_number(packed[a, wp.static(space_dim + 1)])
-                loaded[a] = slots.part_of_state(own.states, own.part_count, number)
+                loaded[a] = space.part_of_state(own.states, own.part_count, number)
             for a in range(wp.static(TOGETHER)):
                 sums.smoothed += packed[a, 0] * loaded[a]
                 if wp.static(state_gradient):
@@ -359,19 +369,20 @@ def sum_functions(
         sync_warp()
         return sums
 
-    return native.namespace(locals(), Lane=Lane, Sums=Sums)
+    return add_states
 
 
 def make_add_searched(
-    variant: PerceptionVariant, slots: SimpleNamespace, summing: SimpleNamespace
+    variant: PerceptionVariant,
+    space: SimpleNamespace,
+    weigh_searched: wp.Function,
+    add_states: wp.Function,
 ) -> wp.Function:
-    """Return the function that searches cells for neighbours of particles with too long a list."""
+    """Return the function that searches the cells for neighbours that do not fit into a list."""
     space_dim, lanes = variant.space_dim, variant.lanes
-    Lane, Sums = summing.Lane, summing.Sums
-    space = domain_types(space_dim, wp.float32)
-    vector, Domain = space.vector, space.Domain
+    vector, cell_vector, Domain = space.vector, space.cell_vector, space.Domain
+    Lane, Sums = space.Lane, space.Sums
     load_vector = make_wide_load(vector)
-    cell_vector = wp.types.vector(space_dim, wp.int32)
     ahead = max(CANDIDATES // lanes, 1)
     candidates_ahead = wp.types.matrix((ahead, space_dim), wp.float32)
 
@@ -384,7 +395,7 @@ def make_add_searched(
         runs: int,
         run: int,
     ):
-        """Return first and last + 1 particle of the cells' run `run`; none from `runs` on."""
+        """Return first and last + 1 particle of cells' run number `run`; none from `runs` on."""
         first_cell, last_cell = space.segment_cells(
             domain, cell, wp.min(run, wp.max(runs - 1, wp.int32(0)))
         )
@@ -401,7 +412,7 @@ def make_add_searched(
         end: int,
         count: int,
     ):
-        """Append neighbours among this thread's next candidates to the slot; return its count."""
+        """Append neighbours among this lane's next candidates to the scratch; return its length."""
         loaded = candidates_ahead()
         total = wp.int32(count)
         for a in range(wp.static(ahead)):
@@ -414,7 +425,7 @@ def make_add_searched(
             if wp.static(variant.periodic):
                 offset = space.periodic_image(domain, offset)
             near = wp.dot(offset, offset) < domain.squared_eps
-            total = slots.append_number(own.slot, total, candidate < end and near, candidate)
+            total = space.append_number(own.scratch, total, candidate < end and near, candidate)
         return total
 
     @wp.func
@@ -429,7 +440,7 @@ def make_add_searched(
         own: Lane,
         sums: Sums,
     ):
-        """Add the neighbours of particles that are `searching`; a complete warp calls it."""
+        """Return `sums` plus neighbours' terms of `searching` particles; whole warps call it."""
         world_cell = wp.int32(0)
         cell = cell_vector()
         particle_runs = wp.int32(0)
@@ -439,15 +450,19 @@ def make_add_searched(
             world_cell = index - local
             cell = space.cell_at(domain, local)
             particle_runs = wp.where(searching, space.segment_count(domain, cell), wp.int32(0))
-        # Each lane looks up one run of cells; all lanes then go through the runs in order.
+        # A warp goes through all its particles' runs of cells side by side; `next_run` is the next
+        # one of `warp_runs`. Each lane looks up one of its particle's next runs, from `lane_begin`
+        # to before `lane_end`. Of the current run, which ends before `end`, a lane tests every
+        # `lanes`-th particle, next `candidate`.
         warp_runs = largest_in_warp(particle_runs)
         next_run = wp.int32(0)
         lane_begin = wp.int32(0)
         lane_end = wp.int32(0)
         candidate = own.lane
         end = wp.int32(0)
-        # The next round leaves as many entries free as this one has beyond a multiple of the lanes:
-        # a neighbour's lane then depends only on its index, not on the rest of the warp.
+        # A round fills the scratch from `begin` to before `count`. The next round leaves as many
+        # entries free as this one has beyond a multiple of the lanes: a neighbour's lane then
+        # depends only on its index, not on the warp's other particles.
         begin = wp.int32(0)
         unfinished = warp_runs > 0
         while unfinished:
@@ -466,104 +481,39 @@ def make_add_searched(
                 count = append_near(domain, sorted_positions, own, candidate, end, count)
                 candidate += wp.static(ahead * lanes)
                 unfinished = next_run < warp_runs or any_in_warp(candidate - own.lane < end)
-                crowded = any_in_warp(count > wp.static(SLOT_ENTRIES - ahead * lanes))
+                crowded = any_in_warp(count > wp.static(SCRATCH_ENTRIES - ahead * lanes))
                 filling = unfinished and not crowded
-            sums = summing.weigh_searched(domain, records, state_index, begin, count, own, sums)
-            sums = summing.add_states(own, count, sums)
+            sums = weigh_searched(domain, records, state_index, begin, count, own, sums)
+            sums = add_states(own, count, sums)
             begin = count & wp.static(lanes - 1)
         return sums
 
     return add_searched
 
 
-def scaling_functions(variant: PerceptionVariant) -> SimpleNamespace:
-    """Return the functions that scale sums logarithmically."""
-    scalar = wp.float32
-    space_dim, lane_width = variant.space_dim, variant.lane_width
-    vector = wp.types.vector(space_dim, scalar)
-    lane_gradient = wp.types.matrix((space_dim, lane_width), scalar)
-    lane_rows = wp.types.vector(lane_width * space_dim, scalar)
-
-    @wp.func
-    def scale_huge(gradient_scale: scalar, gradient: lane_gradient, scaled: lane_rows):
-        """Return `scaled`, corrected where the squared length of a gradient overflows."""
-        result = scaled
-        for c in range(wp.static(lane_width)):
-            along = vector()
-            for d in range(wp.static(space_dim)):
-                along[d] = gradient_scale * gradient[d, c]
-            if wp.isinf(wp.dot(along, along)):
-                along = log_scaled_huge(along)
-                for d in range(wp.static(space_dim)):
-                    result[c * wp.static(space_dim) + d] = along[d]
-        return result
-
-    @wp.func
-    def scaled_gradient(gradient_scale: scalar, gradient: lane_gradient):
-        """Return the logarithmic scaling of a thread's state gradients, channel after channel."""
-        scaled = lane_rows()
-        largest_square = scalar(0.0)
-        for c in range(wp.static(lane_width)):
-            along = vector()
-            for d in range(wp.static(space_dim)):
-                along[d] = gradient_scale * gradient[d, c]
-            squared = wp.dot(along, along)
-            largest_square = wp.max(largest_square, squared)
-            along *= log_scale_of_square(squared)
-            for d in range(wp.static(space_dim)):
-                scaled[c * wp.static(space_dim) + d] = along[d]
-        if wp.isinf(largest_square):
-            scaled = scale_huge(gradient_scale, gradient, scaled)
-        return scaled
-
-    @wp.func
-    def scaled_vector(v: vector):
-        """Return the logarithmic scaling L(v) of a vector."""
-        result = v
-        squared = wp.dot(v, v)
-        if wp.isinf(squared):
-            result = log_scaled_huge(v)
-        else:
-            result *= log_scale_of_square(squared)
-        return result
-
-    return native.namespace(locals())
-
-
 @cached_under_lock()
 def listed_perception(variant: PerceptionVariant) -> wp.Kernel:
-    """Return the kernel that perceives by neighbour lists, with these options."""
-    scalar = wp.float32
+    """Return the perception kernel for neighbour lists, with these options."""
     space_dim, lanes, teams = variant.space_dim, variant.lanes, variant.teams
     state_gradient, moment_correction = variant.state_gradient, variant.moment_inverse is not None
-    grouped, capacity = variant.grouped, variant.capacity
-    for_adjoint, per_particle = variant.for_adjoint, variant.per_particle
+    grouped, capacity, for_adjoint = variant.grouped, variant.capacity, variant.for_adjoint
     width, lane_width, team = variant.width, variant.lane_width, CUDA_LANES
-    space = domain_types(space_dim, scalar)
-    vector, Domain = space.vector, space.Domain
-    vector_f64 = wp.types.vector(space_dim, wp.float64)
-    square = wp.types.matrix((space_dim, space_dim), scalar)
-    lane_channels = wp.types.vector(lane_width, scalar)
-    lane_gradient = wp.types.matrix((space_dim, lane_width), scalar)
-    registers = CUDA_REGISTERS[space_dim] if teams == 1 else TEAM_REGISTERS
+    space = scratch_functions(variant, thread_types(variant))
+    scalar, vector, lane_channels, Domain = space.scalar, space.vector, space.group, space.Domain
+    registers = PERCEIVE_REGISTERS[space_dim] if teams == 1 else TEAM_REGISTERS
     load_vector = make_wide_load(vector)
     add_vector = make_lane_sum(vector, lanes, whole_warps=True)
-    add_square = make_lane_sum(square, lanes, whole_warps=True)
-    add_f64 = make_lane_sum(vector_f64, lanes, whole_warps=True)
+    add_square = make_lane_sum(space.square, lanes, whole_warps=True)
+    add_f64 = make_lane_sum(space.vector_f64, lanes, whole_warps=True)
     add_channels = make_lane_sum(lane_channels, lanes, whole_warps=True, stride=team)
-    add_gradient = make_lane_sum(lane_gradient, lanes, whole_warps=True, stride=team)
+    add_gradient = make_lane_sum(space.group_gradient, lanes, whole_warps=True, stride=team)
     corrected = make_corrected(space_dim, scalar, lane_width, variant.moment_inverse)
-    slots = slot_functions(variant, lane_channels)
-    summing = sum_functions(variant, slots, lane_channels, lane_gradient)
-    add_searched = make_add_searched(variant, slots, summing)
-    scaling = scaling_functions(variant)
+    weighing = weighing_functions(variant, space)
+    add_states = make_add_states(variant, space)
+    add_searched = make_add_searched(variant, space, weighing.weigh_searched, add_states)
+    scaling = scaling_functions(space)
 
-    @wp.kernel(
-        enable_backward=False,
-        module=variant.module(),
-        cuda_max_registers=registers,
-        grid_stride=False,
-    )
+    @wp.kernel(module=variant.module(), cuda_max_registers=registers, grid_stride=False)
     def perceive(
         domain: Domain,
         state_dim: int,
@@ -590,11 +540,10 @@ def listed_perception(variant: PerceptionVariant) -> wp.Kernel:
     ):
         """Write the perception vector of each active particle, as the portable kernel does.
 
-        Thread numbers count a particle's lanes and teams, channel groups and rows, in complete
-        warps, some beyond the last row. `state_index` has the index of each sorted particle's
-        state, by default (empty) the same index; in 2D it is in `records`. Row k is written to row
-        `row_destination[k]`, by default to row k. Numbers are clipped to plus and minus `limit`
-        unless it is 0.
+        A launch has a thread for each row, channel group and lane, in complete warps. `state_index`
+        has the index of each sorted particle's state, if it is empty the same index; in 2D it is in
+        `records`. Row k is written to row `row_destination[k]`, if that is empty to row k. Numbers
+        are clipped to plus and minus `limit` unless it is 0.
         """
         wait_for_previous_kernel()
         thread = thread_number()
@@ -604,9 +553,9 @@ def listed_perception(variant: PerceptionVariant) -> wp.Kernel:
         if wp.static(grouped):
             g = row % group_count
             row = row / group_count
-        own = summing.Lane()
+        own = space.Lane()
         own.lane = lane
-        own.slot = slots.slot_address()
+        own.scratch = space.scratch_address()
         part = lane & wp.static(team - 1)
         own.first = lane >> wp.static(team.bit_length() - 1)
         own.part_count = wp.int32(wp.static(team))
@@ -627,37 +576,29 @@ def listed_perception(variant: PerceptionVariant) -> wp.Kernel:
         if state_index.shape[0] > 0:
             own_index = load_integer(state_index, k)
         own.k = k
-        own.states = slots.part_address(states, part)
-        own.state = slots.part_of_state(own.states, own.part_count, own_index)
+        own.states = space.part_address(states, part)
+        own.state = space.part_of_state(own.states, own.part_count, own_index)
         own.position = load_vector(sorted_positions, k)
         for d in range(wp.static(space_dim)):
             own.precise[d] = wp.float64(own.position[d])
         own.inverse_eps = wp.float64(domain.inverse_eps)
         list_number = safe_row
-        if wp.static(per_particle):
+        if wp.static(variant.per_particle):
             list_number = k
         length = wp.where(present, load_integer(list_lengths, list_number), wp.int32(0))
-        searching = length > wp.static(capacity)
-        length = wp.where(searching, wp.int32(0), length)
+        unlisted = length > wp.static(capacity)
+        length = wp.where(unlisted, wp.int32(0), length)
         longest = largest_in_warp(length)
-        sums = summing.Sums()
-        pair = summing.pair_at(lists, list_number, lane)
-        for begin in range(0, longest, wp.static(SLOT_ENTRIES)):
-            pair, sums = summing.weigh_listed(
+        sums = space.Sums()
+        pair = weighing.pair_at(lists, list_number, lane)
+        for begin in range(0, longest, wp.static(SCRATCH_ENTRIES)):
+            pair, sums = weighing.weigh_listed(
                 domain, records, lists, state_index, list_number, begin, length, own, pair, sums
             )
-            count = wp.clamp(length - begin, 0, wp.static(SLOT_ENTRIES))
-            sums = summing.add_states(own, count, sums)
+            count = wp.clamp(length - begin, 0, wp.static(SCRATCH_ENTRIES))
+            sums = add_states(own, count, sums)
         sums = add_searched(
-            domain,
-            starts,
-            sorted_cell,
-            sorted_positions,
-            records,
-            state_index,
-            searching,
-            own,
-            sums,
+            domain, starts, sorted_cell, sorted_positions, records, state_index, unlisted, own, sums
         )
         smoothed = sums.smoothed
         gradient = sums.gradient
@@ -672,13 +613,13 @@ def listed_perception(variant: PerceptionVariant) -> wp.Kernel:
                     moment[r, c] = moment[c, r]
             gradient = corrected(gradient, moment)
         channel = (lane & wp.static(team - 1)) * wp.static(lane_width)
-        stage(own.slot, channel, wp.where(present, own.state, lane_channels()))
-        stage(own.slot, wp.static(width) + channel, smoothed)
+        stage(own.scratch, channel, wp.where(present, own.state, lane_channels()))
+        stage(own.scratch, wp.static(width) + channel, smoothed)
         if wp.static(state_gradient):
             scaled = scaling.scaled_gradient(gradient_scale, gradient)
-            stage(own.slot, wp.static(2 * width) + channel * wp.static(space_dim), scaled)
+            stage(own.scratch, wp.static(2 * width) + channel * wp.static(space_dim), scaled)
         bound = wp.where(limit > scalar(0.0), limit, scalar(wp.static(math.nan)))
-        slots.write_rows(own.slot, destination, g, state_dim, bound, perception)
+        space.write_rows(own.scratch, destination, g, state_dim, bound, perception)
         if wp.static(for_adjoint):
             kernel_sum = add_vector(sums.kernel)
             if destination >= 0 and lane == 0 and g == 0:

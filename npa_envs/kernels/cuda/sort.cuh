@@ -1,4 +1,4 @@
-// Sorting a world into cells by one block, in shared memory, for the kernels of cuda/sort.py.
+// For cuda/sort.py: one block sorts the particles of a world into cells, in shared memory.
 
 namespace npa {
 

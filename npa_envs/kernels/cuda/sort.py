@@ -1,9 +1,8 @@
 """Cell lists of small worlds on CUDA, also of splats: a block sorts a world in shared memory.
 
-The same order as in the portable kernels, in one launch instead of six: particles are counted by
+The order is that of the portable kernels, in one launch instead of six: particles are counted by
 cell, the counts are added up, particles get provisional positions in order of arrival, and ranks
-among indices replace these. If worlds are few, several blocks sort the same world, and each writes
-a slice.
+among indices replace these. Several blocks share a world if worlds are few: each writes a slice.
 """
 
 from types import SimpleNamespace
@@ -35,15 +34,11 @@ load_pair = make_wide_load(wp.vec2i)
 BLOCKS = {1024: 256, 4096: 1024}
 """Threads of a block by its capacity in particles."""
 
-RESIDENT_THREADS = 1024
-"""Threads for which a multiprocessor has enough registers."""
-
-MAX_GRID = 4096
-"""Most cells of a world that a block sorts."""
+RESIDENT_THREADS, MAX_GRID = 1024, 4096
+"""Threads for which a multiprocessor has registers; maximum cells of a world that a block sorts."""
 
 THREAD_CHANNELS = 4
 """Adjacent channels that a thread moves."""
-
 
 count_active = native.function("count_active", mask=wp.array[wp.uint8], count=int, returns=int)
 """The number of active particles in this thread's part of `mask`, up to `count`."""
@@ -51,11 +46,11 @@ count_active = native.function("count_active", mask=wp.array[wp.uint8], count=in
 
 @cached_under_lock()
 def block_functions(capacity: int) -> SimpleNamespace:
-    """Return the functions by which a block sorts a world of up to `capacity` particles."""
+    """Return the C++ functions with which a block sorts a world of up to `capacity` particles."""
     sizes = capacity, BLOCKS[capacity], MAX_GRID
 
     def of_block(name: str, returns: Any = None, **arguments: Any) -> Any:
-        """Return the C++ function `name` for Warp; it takes the block's `block_memory` first."""
+        """Return a Warp function for the C++ function `name` of a `block_memory`."""
         return native.function(name, *sizes, address=wp.uint64, **arguments, returns=returns)
 
     return SimpleNamespace(
@@ -73,7 +68,7 @@ def block_functions(capacity: int) -> SimpleNamespace:
 
 @cached_under_lock()
 def sort_small_worlds(space_dim: int, capacity: int) -> wp.Kernel:
-    """Return the kernel that sorts worlds of up to `capacity` particles in float32, by blocks."""
+    """Return the kernel that sorts float32 worlds of up to `capacity` particles, by blocks."""
     scalar = wp.float32
     block = BLOCKS[capacity]
     rounds = capacity // block
@@ -85,12 +80,9 @@ def sort_small_worlds(space_dim: int, capacity: int) -> wp.Kernel:
     load_vector = make_wide_load(vector)
     read_channels = make_read_channels(channels)
     sorting = block_functions(capacity)
+    module = kernel_module("small_worlds", space_dim, scalar, capacity=capacity)
 
-    @wp.kernel(
-        enable_backward=False,
-        launch_bounds=(block, RESIDENT_THREADS // block),
-        module=kernel_module("small_worlds", space_dim, scalar, capacity=capacity),
-    )
+    @wp.kernel(module=module, launch_bounds=(block, RESIDENT_THREADS // block))
     def sort_worlds(
         domain: Domain,
         particle_count: int,
@@ -115,7 +107,7 @@ def sort_small_worlds(space_dim: int, capacity: int) -> wp.Kernel:
         row_positions: wp.array[vector],
         sorted_states: wp.array[channels],
     ):
-        """Sort a world by cell, then index: each of its blocks sorts all of it, writes a slice."""
+        """Sort a world by cell, then index: each of its blocks sorts it and writes a slice."""
         wait_for_previous_kernel()
         world = block_number() / slice_count
         slice_number = block_number() - world * slice_count
@@ -202,10 +194,9 @@ def sort_small_worlds(space_dim: int, capacity: int) -> wp.Kernel:
 
 @cached_under_lock()
 def sort_small_splats(capacity: int) -> wp.Kernel:
-    """Return the kernel that sorts particles' footprints on pictures, for small worlds.
+    """Return the kernel that sorts the footprints of small worlds' particles on pictures.
 
-    They are the same, in the same order, as in `pictures/splat.py`. A block also computes the mean
-    position of its world.
+    Footprints and order are those of `pictures/splat.py`. A block also computes its world's mean.
     """
     scalar = wp.float32
     block = BLOCKS[capacity]
@@ -213,15 +204,11 @@ def sort_small_splats(capacity: int) -> wp.Kernel:
     View, vector, footprint_type = types.View, types.vector, types.footprint
     load_vector = make_wide_load(vector)
     sorting = block_functions(capacity)
-
     world = {"positions": wp.array[vector], "first": int, "count": int}
     mean_of_world = native.function("mean_of_world", capacity, CHUNK, **world, returns=vector)
+    module = native.module(f"npa_envs.kernels.small_splats_{capacity}")
 
-    @wp.kernel(
-        enable_backward=False,
-        launch_bounds=(block, RESIDENT_THREADS // block),
-        module=native.module(f"npa_envs.kernels.small_splats_{capacity}"),
-    )
+    @wp.kernel(module=module, launch_bounds=(block, RESIDENT_THREADS // block))
     def sort_splats(
         view: View,
         slice_count: int,
@@ -289,7 +276,7 @@ def sort_small_splats(capacity: int) -> wp.Kernel:
 
 @cached_under_lock()
 def order_particles(space_dim: int, width: int) -> wp.Kernel:
-    """Return the last kernel of sorting large worlds; a warp moves the states of 32 particles."""
+    """Return the last kernel that sorts large worlds; a warp moves states of 32 particles."""
     scalar = wp.float32
     vector = domain_types(space_dim, scalar).vector
     thread_width = width // CUDA_LANES
@@ -297,7 +284,7 @@ def order_particles(space_dim: int, width: int) -> wp.Kernel:
     held_type = wp.types.matrix((CUDA_LANES, thread_width), scalar)
     read_channels = make_read_channels(channels)
 
-    @wp.kernel(enable_backward=False, module=kernel_module("order", space_dim, scalar, width=width))
+    @wp.kernel(module=kernel_module("order", space_dim, scalar, width=width))
     def order_particles(
         positions: wp.array[vector],
         state_dim: int,

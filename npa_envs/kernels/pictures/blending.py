@@ -54,7 +54,7 @@ PATCH_WIDTH, PATCH_HEIGHT = 8, 4
 """Pixels of a tile that a warp serves: nearly square, so that it can skip most Gaussians."""
 
 BATCH = 32
-"""Pairs whose cotangents a block keeps in shared memory before it adds those of its warps."""
+"""Pairs whose gradients a block keeps in shared memory before it adds those of its warps."""
 
 TO_POWER_OF_TWO = -0.7213475204444817
 """-1/2 log2(e), the factor of p in exp(-1/2 p) as a power of two."""
@@ -62,7 +62,7 @@ TO_POWER_OF_TWO = -0.7213475204444817
 
 @cached_under_lock()
 def blending_functions(scalar: type) -> SimpleNamespace:
-    """Return the functions of all kernels: a Gaussian's effect on a pixel, and its adjoint."""
+    """Return the functions that kernels share: a Gaussian's effect on a pixel, and gradients."""
     types = gaussian_types(scalar)
     Frame, quad, footprint_type, bar_type = types.Frame, types.quad, types.footprint, types.tile_bar
     fast_exp2 = native.function("fast_exp2", value=scalar, returns=scalar)
@@ -88,10 +88,10 @@ def blending_functions(scalar: type) -> SimpleNamespace:
         through: scalar,
         behind: scalar,
     ):
-        """Return a pixel's cotangents of a Gaussian, and `through` and `behind` in front of it.
+        """Return a Gaussian's gradients from a pixel, and `through` and `behind` in front of it.
 
         Given are those behind it: `through` is the transmittance T, `behind` the final T times its
-        cotangent plus (c . c̄) alpha T of farther Gaussians. `bar` is c̄, the colours' cotangent.
+        gradient plus (c . c̄) alpha T of farther Gaussians. `bar` is c̄, the pixel's gradient.
         """
         alpha = wp.min(strength, scalar(MAX_ALPHA))
         rest = scalar(1.0) / (scalar(1.0) - alpha)
@@ -141,7 +141,7 @@ def blending_functions(scalar: type) -> SimpleNamespace:
 
 @cached_under_lock()
 def tile_kernels(scalar: type) -> SimpleNamespace:
-    """Return the kernels that blend Gaussians, and the adjoint, one thread per tile; for CPUs."""
+    """Return the forward and the backward kernel of blending, one thread per tile; for CPUs."""
     types = gaussian_types(scalar)
     Frame, footprint_type, bar_type = types.Frame, types.footprint, types.tile_bar
     blending = blending_functions(scalar)
@@ -150,7 +150,7 @@ def tile_kernels(scalar: type) -> SimpleNamespace:
 
     @wp.func
     def shared_pixels(frame: Frame, tile: int, footprint: footprint_type):
-        """Return first, and then last + 1, column and row of a tile's pixels in a footprint."""
+        """Return first column and row, then last + 1 ones, of a tile's pixels in a footprint."""
         tile_in_picture = tile % frame.tile_count
         row = tile_in_picture / frame.tile_columns * wp.static(TILE_SIDE)
         column = tile_in_picture % frame.tile_columns * wp.static(TILE_SIDE)
@@ -164,7 +164,7 @@ def tile_kernels(scalar: type) -> SimpleNamespace:
         )
 
     @in_ranges(TILES)
-    @wp.kernel(enable_backward=False, module=module)
+    @wp.kernel(module=module)
     def draw_tiles(
         range_start: int,
         frame: Frame,
@@ -177,9 +177,9 @@ def tile_kernels(scalar: type) -> SimpleNamespace:
         # outputs
         stops: wp.array[wp.int32],
     ):
-        """Blend the Gaussians of a tile; `stops` gets the first pair that a pixel ignores.
+        """Blend the Gaussians of a tile; `stops` becomes the first pair that a pixel ignores.
 
-        Pairs are of a tile and a Gaussian. Initial `stops` must be beyond all pairs.
+        A pair is a tile and a Gaussian that covers it. Initial `stops` must be beyond all pairs.
         """
         tile = range_start + wp.tid()
         image = tile / frame.tile_count
@@ -206,7 +206,7 @@ def tile_kernels(scalar: type) -> SimpleNamespace:
                                 picture[pixel, c] = picture[pixel, c] + added
 
     @in_ranges(TILES)
-    @wp.kernel(enable_backward=False, module=module)
+    @wp.kernel(module=module)
     def pull_back_tiles(
         range_start: int,
         frame: Frame,
@@ -222,7 +222,7 @@ def tile_kernels(scalar: type) -> SimpleNamespace:
         # outputs
         tile_bars: wp.array[bar_type],
     ):
-        """Write the cotangents of a tile's Gaussians, each to the slot of its pair with a tile."""
+        """Write the gradients by a tile's Gaussians, each at the index `pair_slots` of its pair."""
         tile = range_start + wp.tid()
         image = tile / frame.tile_count
         begin = starts[tile]
@@ -253,7 +253,7 @@ def tile_kernels(scalar: type) -> SimpleNamespace:
 
 @cached_under_lock()
 def block_kernels(scalar: type) -> SimpleNamespace:
-    """Return the kernels that blend Gaussians, and the adjoint, one block per tile; for CUDA."""
+    """Return the forward and the backward kernel of blending, one block per tile; for CUDA."""
     types = gaussian_types(scalar)
     Frame, quad, footprint_type, bar_type = types.Frame, types.quad, types.footprint, types.tile_bar
     blending = blending_functions(scalar)
@@ -281,7 +281,7 @@ def block_kernels(scalar: type) -> SimpleNamespace:
         row += patch / across * wp.static(PATCH_HEIGHT) + lane / wp.static(PATCH_WIDTH)
         return column, row
 
-    @wp.kernel(enable_backward=False, module=drawing_module)
+    @wp.kernel(module=drawing_module)
     def draw_blocks(
         frame: Frame,
         starts: wp.array[wp.int32],
@@ -323,7 +323,7 @@ def block_kernels(scalar: type) -> SimpleNamespace:
             passing[pixel] = through
             stops[pixel] = stop
 
-    @wp.kernel(enable_backward=False, module=adjoint_module)
+    @wp.kernel(module=adjoint_module)
     def pull_back_blocks(
         frame: Frame,
         starts: wp.array[wp.int32],
@@ -337,7 +337,7 @@ def block_kernels(scalar: type) -> SimpleNamespace:
         # outputs
         tile_bars: wp.array[scalar],
     ):
-        """Write the cotangents of a tile's Gaussians, each to the slot of its pair with a tile.
+        """Write the gradients by a tile's Gaussians, each at the index `pair_slots` of its pair.
 
         A block serves a tile; all its threads go through all pairs, as they sum together.
         """

@@ -31,21 +31,16 @@ from npa_envs.kernels.primitives import (
 from npa_envs.thread_lock import cached_under_lock
 
 BLOCK_TILES = CUDA_BLOCK
-"""Most tiles of a block: each thread counts the particles around one."""
+"""Maximum number of tiles of a block: each thread counts the particles around one."""
 
-BLOCK_WARPS = CUDA_BLOCK // WARP
-"""Warps of a block."""
-
-WARP_TILES = WARP // TILE_LANES
-"""Tiles that a warp serves together."""
-
+BLOCK_WARPS, WARP_TILES = CUDA_BLOCK // WARP, WARP // TILE_LANES
 ROUND_TILES = WARP_TILES * BLOCK_WARPS
-"""Tiles that a block serves at a time."""
+"""Warps of a block, tiles that a warp serves together, and tiles that a block serves together."""
 
 
 @cached_under_lock()
 def make_pixel_errors(scalar: type) -> wp.Function:
-    """Return a Warp function of a pixel's density error and colour error.
+    """Return a Warp function for the density error and the colour error of a pixel.
 
     The density error is |d| + d² of the difference d in density; the colour error is the sum of the
     same over red, green and blue, times exp(-density error).
@@ -69,7 +64,7 @@ def make_pixel_errors(scalar: type) -> wp.Function:
 
 @cached_under_lock()
 def gather_errors(scalar: type) -> wp.Kernel:
-    """Return the kernel that sums particles at pixels and compares with a target; for CUDA."""
+    """Return the kernel that draws pictures by tiles and compares them with a target, for CUDA."""
     types = splat_types(scalar)
     View, colour_type, footprint_type = types.View, types.colour, types.footprint
     row_type = wp.types.matrix((CHANNELS, TILE_WIDTH), scalar)
@@ -77,16 +72,12 @@ def gather_errors(scalar: type) -> wp.Kernel:
     pixel_errors = make_pixel_errors(scalar)
     load_colour = make_wide_load(colour_type)
     lane_sum = make_lane_sum(wp.vec2d, TILE_LANES)
+    module = native.module(f"npa_envs.kernels.errors_{scalar_name(scalar)}")
 
     rank_tiles = native.function("rank_tiles", BLOCK_TILES, tile_count=int, candidates=int)
     ranked_tile = native.function("ranked_tile", BLOCK_TILES, rank=int, returns=wp.vec2i)
 
-    @wp.kernel(
-        enable_backward=False,
-        module=native.module(f"npa_envs.kernels.errors_{scalar_name(scalar)}"),
-        cuda_max_registers=gather_registers(scalar),
-        grid_stride=False,
-    )
+    @wp.kernel(module=module, cuda_max_registers=gather_registers(scalar), grid_stride=False)
     def gather_errors(
         view: View,
         tile_count: int,
@@ -150,10 +141,7 @@ def sum_errors(scalar: type) -> wp.Kernel:
     colour_type = splat_types(scalar).colour
     pixel_errors = make_pixel_errors(scalar)
 
-    @wp.kernel(
-        enable_backward=False,
-        module=native.module(f"npa_envs.kernels.drawn_errors_{scalar_name(scalar)}"),
-    )
+    @wp.kernel(module=native.module(f"npa_envs.kernels.drawn_errors_{scalar_name(scalar)}"))
     def sum_errors(
         picture: wp.array3d[colour_type],
         target: wp.array2d[colour_type],

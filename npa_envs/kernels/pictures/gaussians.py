@@ -149,7 +149,7 @@ def gaussian_functions(scalar: type) -> SimpleNamespace:
 
     @wp.func
     def pull_back_rotation(q: quad, bar: cube):
-        """Return the cotangent of a unit quaternion from that of its rotation matrix."""
+        """Return the loss gradient by a unit quaternion from `bar`, that by its rotation matrix."""
         w = q[0]
         x = q[1]
         y = q[2]
@@ -185,7 +185,7 @@ def gaussian_functions(scalar: type) -> SimpleNamespace:
 
     @wp.func
     def limited(ratio: scalar, focal: scalar, middle: scalar, size: scalar):
-        """Return x/z (`ratio`), clamped to a margin around the picture, for J of the projection."""
+        """Return x/z or y/z (`ratio`), clamped to a margin around the picture, for J."""
         margin = scalar(wp.static(0.5 * CLAMP_MARGIN)) * size
         return wp.clamp(ratio, (-middle - margin) / focal, (size - middle + margin) / focal)
 
@@ -198,7 +198,7 @@ def gaussian_functions(scalar: type) -> SimpleNamespace:
 
     @wp.func
     def jacobian_of(frame: Frame, camera: quad, position: triple):
-        """Return J, the derivative of a point's picture coordinates by its camera coordinates."""
+        """Return J [2, 3], the derivative of a point on the picture by the point in the camera."""
         ratios = limited_ratios(frame, camera, position)
         x = camera[0] / position[2]
         y = camera[1] / position[2]
@@ -237,7 +237,7 @@ def gaussian_functions(scalar: type) -> SimpleNamespace:
 
     @wp.func
     def colours_of(colours: wp.array2d[scalar], i: int, motion: motion_type, mean: triple):
-        """Return a Gaussian's colours, padded with 0; 12 numbers are of spherical harmonics."""
+        """Return a Gaussian's 4 colours, padded with 0; 12 numbers are spherical harmonics."""
         result = quad()
         if colours.shape[1] <= wp.static(CHANNELS):
             for c in range(wp.static(CHANNELS)):
@@ -254,7 +254,7 @@ def gaussian_functions(scalar: type) -> SimpleNamespace:
 
     @wp.func
     def covered_tiles(frame: Frame, footprint: footprint_type):
-        """Return first, and then last + 1, column and row of the tiles in a footprint."""
+        """Return first column and row, then last + 1 ones, of the tiles in a footprint."""
         left, right = covered(footprint[0], footprint[10], frame.width)
         top, bottom = covered(footprint[1], footprint[11], frame.height)
         result = wp.vec4i()
@@ -270,17 +270,21 @@ def gaussian_functions(scalar: type) -> SimpleNamespace:
 
 @cached_under_lock()
 def gaussian_kernels(scalar: type) -> SimpleNamespace:
-    """Return the kernels that project 3D Gaussians, list the tiles they cover, and the adjoint."""
-    types, gaussian = gaussian_types(scalar), gaussian_functions(scalar)
-    Frame, pair, triple, quad = types.Frame, types.pair, types.triple, types.quad
-    footprint_type, bar_type, harmonics_type = types.footprint, types.tile_bar, types.harmonics
-    square, cube, motion_type = types.square, types.cube, types.motion
+    """Return the kernels that project 3D Gaussians, list the tiles they cover, and pull back."""
     module = native.module(f"npa_envs.kernels.gaussians_{scalar_name(scalar)}")
+    kernels = vars(projection_kernels(scalar, module))
+    return SimpleNamespace(**kernels, pull_back_gaussians=adjoint_kernel(scalar, module))
+
+
+def projection_kernels(scalar: type, module: wp.Module) -> SimpleNamespace:
+    """Return the kernels that project Gaussians and list the tiles that these cover."""
+    types, gaussian = gaussian_types(scalar), gaussian_functions(scalar)
+    Frame, triple, quad = types.Frame, types.triple, types.quad
+    footprint_type, motion_type = types.footprint, types.motion
     load_footprint = make_wide_load(footprint_type)
-    load_tile_bar = make_wide_load(bar_type)
 
     @in_ranges(PAIRS)
-    @wp.kernel(enable_backward=False, module=module)
+    @wp.kernel(module=module)
     def project_gaussians(
         range_start: int,
         frame: Frame,
@@ -354,7 +358,7 @@ def gaussian_kernels(scalar: type) -> SimpleNamespace:
         counts[entry] = count
 
     @in_ranges(PAIRS)
-    @wp.kernel(enable_backward=False, module=module)
+    @wp.kernel(module=module)
     def list_pairs(
         range_start: int,
         frame: Frame,
@@ -392,8 +396,19 @@ def gaussian_kernels(scalar: type) -> SimpleNamespace:
                     next_slot += 1
         slots[entry] = slot
 
+    return namespace(locals())
+
+
+def adjoint_kernel(scalar: type, module: wp.Module) -> wp.Kernel:
+    """Return the backward kernel of Gaussians, which adds up their gradients from tiles."""
+    types, gaussian = gaussian_types(scalar), gaussian_functions(scalar)
+    Frame, pair, triple, quad = types.Frame, types.pair, types.triple, types.quad
+    footprint_type, bar_type, harmonics_type = types.footprint, types.tile_bar, types.harmonics
+    square, cube, motion_type = types.square, types.cube, types.motion
+    load_footprint, load_tile_bar = make_wide_load(footprint_type), make_wide_load(bar_type)
+
     @in_ranges(PAIRS)
-    @wp.kernel(enable_backward=False, module=module)
+    @wp.kernel(module=module)
     def pull_back_gaussians(
         range_start: int,
         frame: Frame,
@@ -414,7 +429,7 @@ def gaussian_kernels(scalar: type) -> SimpleNamespace:
         opacities_bar: wp.array[scalar],
         colours_bar: wp.array2d[scalar],
     ):
-        """Write the cotangents of each Gaussian: sums over its views and, in each, its tiles."""
+        """Write loss gradients by Gaussians: sums over views and, in each view, over tiles."""
         i = range_start + wp.tid()
         world = i / frame.particle_count
         mean = means[i]
@@ -506,4 +521,4 @@ def gaussian_kernels(scalar: type) -> SimpleNamespace:
                 for c in range(3):
                     colours_bar[i, 3 * k + c] = harmonics_bar[k, c]
 
-    return namespace(locals())
+    return pull_back_gaussians

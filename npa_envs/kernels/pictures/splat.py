@@ -31,19 +31,19 @@ from npa_envs.kernels.primitives import (
 from npa_envs.thread_lock import cached_under_lock
 
 CHANNELS = 4
-"""Red, green, blue and density."""
+"""Channels of a picture: red, green, blue and density."""
 
 TILE_WIDTH, TILE_HEIGHT = 4, 4
-"""Pixels of a tile, which `TILE_LANES` CUDA threads gather, and of a cell."""
+"""Pixels along each side of a tile, which `TILE_LANES` CUDA threads gather, and of a cell."""
 
 TILE_LANES = 4
-"""CUDA threads that share a tile's candidates, or a particle's cotangents; on a CPU it is one."""
+"""CUDA threads that share a tile's candidates, or a particle's gradients; on a CPU it is one."""
 
 RUNS = 3
 """Runs of particles, one for each row of cells, that are gathered as one."""
 
-CUDA_REGISTERS = 128
-"""Registers per thread in the gathering of float32, enough for all sums of a tile."""
+GATHER_REGISTERS = 128
+"""Registers per thread of `gather_splats` in float32, enough for all sums of a tile."""
 
 GROUP_WIDTH, GROUP_HEIGHT = 4, 2
 """Tiles of a group, which one warp gathers."""
@@ -119,8 +119,8 @@ def make_view(
 
 
 def gather_registers(scalar: type) -> int | None:
-    """Return the most registers of a CUDA thread that gathers splats; None: no limit."""
-    return CUDA_REGISTERS if scalar == wp.float32 else None
+    """Return the maximum number of registers per thread of `gather_splats`; None: no limit."""
+    return GATHER_REGISTERS if scalar == wp.float32 else None
 
 
 def group_count(resolution: int) -> int:
@@ -156,6 +156,15 @@ def splat_functions(scalar: type) -> SimpleNamespace:
             (moved[0] - view.low) * view.pixels_per_length,
             (moved[1] - view.low) * view.pixels_per_length,
         )
+
+    @wp.func
+    def position_in_world(
+        view: View, position: vector, means: wp.array[vector], goal: wp.array[vector], world: int
+    ):
+        mean = vector()
+        if goal.shape[0] > 0:
+            mean = means[world]
+        return pixel_position(view, position, mean, goal)
 
     @wp.func
     def patch_centre(position: vector):
@@ -300,29 +309,22 @@ def gather_functions(scalar: type, lanes: int) -> SimpleNamespace:
 
 @cached_under_lock()
 def splat_kernels(scalar: type, lanes: int) -> SimpleNamespace:
-    """Return the kernels that draw worlds, and the adjoint; `lanes` threads a tile or particle."""
-    types = splat_types(scalar)
-    View, vector, colour_type = types.View, types.vector, types.colour
-    footprint_type, bar_type = types.footprint, types.splat_bar
-    group_tiles = GROUP_WIDTH * GROUP_HEIGHT
-    lane_pixels = TILE_WIDTH * TILE_HEIGHT // lanes
+    """Return the kernels that draw worlds and pull back; `lanes` threads per tile or particle."""
     module = native.module(f"npa_envs.kernels.splat_{scalar_name(scalar)}_l{lanes}")
-    load_footprint = make_wide_load(footprint_type)
-    load_colour = make_wide_load(colour_type)
-    lane_sum = make_lane_sum(bar_type, lanes)
-    splat = splat_functions(scalar)
-    gather_tile = gather_functions(scalar, lanes).gather_tile
+    return SimpleNamespace(
+        **vars(sorting_kernels(scalar, module)),
+        gather_splats=gathering_kernel(scalar, lanes, module),
+        scatter_splats=scattering_kernel(scalar, module),
+        pull_back_splats=adjoint_kernel(scalar, lanes, module),
+    )
 
-    @wp.func
-    def position_in_world(
-        view: View, position: vector, means: wp.array[vector], goal: wp.array[vector], world: int
-    ):
-        mean = vector()
-        if goal.shape[0] > 0:
-            mean = means[world]
-        return splat.pixel_position(view, position, mean, goal)
 
-    @wp.kernel(enable_backward=False, module=module)
+def sorting_kernels(scalar: type, module: wp.Module) -> SimpleNamespace:
+    """Return the kernels that sort particles' footprints by cells."""
+    types, splat = splat_types(scalar), splat_functions(scalar)
+    View, vector, footprint_type = types.View, types.vector, types.footprint
+
+    @wp.kernel(module=module)
     def count_splats(
         view: View,
         particle_count: int,
@@ -341,12 +343,12 @@ def splat_kernels(scalar: type, lanes: int) -> SimpleNamespace:
         wait_for_previous_kernel()
         i = wp.tid()
         world = i / particle_count
-        position = position_in_world(view, positions[i], means, goal, world)
+        position = splat.position_in_world(view, positions[i], means, goal, world)
         index = world * view.cell_count + splat.cell_of_centre(view, splat.patch_centre(position))
         cell[i] = index
         arrival[i] = wp.atomic_add(counts, index + 1, 1)
 
-    @wp.kernel(enable_backward=False, module=module)
+    @wp.kernel(module=module)
     def place_splats(
         cell: wp.array[wp.int32],
         arrival: wp.array[wp.int32],
@@ -359,7 +361,7 @@ def splat_kernels(scalar: type, lanes: int) -> SimpleNamespace:
         i = wp.tid()
         arrived[starts[cell[i]] + arrival[i]] = i
 
-    @wp.kernel(enable_backward=False, module=module)
+    @wp.kernel(module=module)
     def order_splats(
         view: View,
         particle_count: int,
@@ -381,7 +383,7 @@ def splat_kernels(scalar: type, lanes: int) -> SimpleNamespace:
         i = arrived[k]
         c = cell[i]
         world = i / particle_count
-        position = position_in_world(view, positions[i], means, goal, world)
+        position = splat.position_in_world(view, positions[i], means, goal, world)
         footprint = splat.footprint_of(view, position, i, states, shift)
         begin = starts[c]
         target = k
@@ -394,9 +396,19 @@ def splat_kernels(scalar: type, lanes: int) -> SimpleNamespace:
         wide_store(footprints, target, footprint)
         original_index[target] = i
 
+    return namespace(locals())
+
+
+def gathering_kernel(scalar: type, lanes: int, module: wp.Module) -> wp.Kernel:
+    """Return the kernel that draws by tiles of pixels, for CUDA."""
+    types, gather_tile = splat_types(scalar), gather_functions(scalar, lanes).gather_tile
+    View, colour_type = types.View, types.colour
+    group_tiles = GROUP_WIDTH * GROUP_HEIGHT
+    lane_pixels = TILE_WIDTH * TILE_HEIGHT // lanes
+
     @wp.func
     def tile_of(view: View, t: int):
-        """Return world, row and column of thread t's tile, and the thread's number in it."""
+        """Return world, row and column of thread t's tile, and the thread's number in the tile."""
         across = (view.tile_columns + wp.static(GROUP_WIDTH - 1)) / wp.static(GROUP_WIDTH)
         down = (view.tile_rows + wp.static(GROUP_HEIGHT - 1)) / wp.static(GROUP_HEIGHT)
         tile = t / wp.static(lanes)
@@ -418,11 +430,11 @@ def splat_kernels(scalar: type, lanes: int) -> SimpleNamespace:
             pixel = wp.int32(-1)
         return pixel
 
-    @wp.kernel(enable_backward=False, module=module, cuda_max_registers=gather_registers(scalar))
+    @wp.kernel(module=module, cuda_max_registers=gather_registers(scalar))
     def gather_splats(
         view: View,
         starts: wp.array[wp.int32],
-        footprints: wp.array[footprint_type],
+        footprints: wp.array[types.footprint],
         # outputs
         picture: wp.array[colour_type],
     ):
@@ -437,11 +449,19 @@ def splat_kernels(scalar: type, lanes: int) -> SimpleNamespace:
                     value = colour_type(values[0, k], values[1, k], values[2, k], values[3, k])
                     wide_store(picture, begin + pixel, value)
 
+    return gather_splats
+
+
+def scattering_kernel(scalar: type, module: wp.Module) -> wp.Kernel:
+    """Return the kernel that draws by particles, for CPUs."""
+    types, splat = splat_types(scalar), splat_functions(scalar)
+    vector = types.vector
+
     @in_ranges(WORLDS)
-    @wp.kernel(enable_backward=False, module=module)
+    @wp.kernel(module=module)
     def scatter_splats(
         range_start: int,
-        view: View,
+        view: types.View,
         particle_count: int,
         positions: wp.array[vector],
         states: wp.array2d[scalar],
@@ -450,15 +470,15 @@ def splat_kernels(scalar: type, lanes: int) -> SimpleNamespace:
         goal: wp.array[vector],
         scratch: wp.array2d[scalar],
         # added to
-        picture: wp.array3d[colour_type],
+        picture: wp.array3d[types.colour],
         # outputs
-        footprints: wp.array[footprint_type],
+        footprints: wp.array[types.footprint],
         original_index: wp.array[wp.int32],
     ):
-        """Draw the picture of a world, particle after particle; for devices with few threads."""
+        """Draw a world's picture, particle after particle; for devices with few threads."""
         world = range_start + wp.tid()
         for i in range(world * particle_count, (world + 1) * particle_count):
-            position = position_in_world(view, positions[i], means, goal, world)
+            position = splat.position_in_world(view, positions[i], means, goal, world)
             footprint = splat.footprint_of(view, position, i, states, shift)
             footprints[i] = footprint
             original_index[i] = i
@@ -480,20 +500,30 @@ def splat_kernels(scalar: type, lanes: int) -> SimpleNamespace:
                         drawn = picture[world, p, q]
                         picture[world, p, q] = drawn + scratch[world, q - left] * along
 
+    return scatter_splats
+
+
+def adjoint_kernel(scalar: type, lanes: int, module: wp.Module) -> wp.Kernel:
+    """Return the backward kernel: loss gradients by particles' positions and colours."""
+    types, splat = splat_types(scalar), splat_functions(scalar)
+    vector, colour_type, bar_type = types.vector, types.colour, types.splat_bar
+    load_footprint, load_colour = make_wide_load(types.footprint), make_wide_load(colour_type)
+    lane_sum = make_lane_sum(bar_type, lanes)
+
     @in_ranges(PAIRS)
-    @wp.kernel(enable_backward=False, module=module)
+    @wp.kernel(module=module)
     def pull_back_splats(
         range_start: int,
-        view: View,
+        view: types.View,
         particle_count: int,
-        footprints: wp.array[footprint_type],
+        footprints: wp.array[types.footprint],
         original_index: wp.array[wp.int32],
         picture_bar: wp.array[colour_type],
         # outputs
         positions_bar: wp.array[vector],
         colours_bar: wp.array2d[scalar],
     ):
-        """Write the cotangents of particles' positions and colours from those of the pixels."""
+        """Write loss gradients by particles' positions and colours, from those by pixels."""
         k, lane = wp.tid()
         k += range_start
         world = k / particle_count
@@ -551,4 +581,4 @@ def splat_kernels(scalar: type, lanes: int) -> SimpleNamespace:
             for c in range(3):
                 colours_bar[i, c] = colour_bar[c]
 
-    return namespace(locals())
+    return pull_back_splats

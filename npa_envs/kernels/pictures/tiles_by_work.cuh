@@ -1,4 +1,4 @@
-// Order of a picture's tiles by descending numbers of candidates, for the kernels of errors.py.
+// For pictures/errors.py: order of a picture's tiles by descending numbers of candidates.
 
 namespace npa {
 

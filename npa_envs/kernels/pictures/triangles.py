@@ -31,7 +31,7 @@ def draw_triangles(
     nearest: wp.array2d[wp.float64],
     picture: wp.array2d[wp.vec4d],
 ):
-    """Draw all triangles visible to a camera, at every pixel whose centre they cover."""
+    """Draw the triangles visible to a camera: at each pixel the nearest over its centre."""
     camera = range_start + wp.tid()
     zero, half = wp.float64(0.0), wp.float64(0.5)
     for face in range(faces.shape[0]):

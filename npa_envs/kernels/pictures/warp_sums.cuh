@@ -1,4 +1,4 @@
-// Sums over the warps of a block, in shared memory: for the backward pass of blending.py.
+// For pictures/blending.py: backward pass; sums over the warps of a block, in shared memory.
 
 namespace npa {
 
@@ -7,14 +7,14 @@ namespace npa {
 template <int BATCH, int WARPS, unsigned SIZE, typename Part>
 __device__ inline Part store_or_sum(bool write, int i, int entry, wp::vec_t<SIZE, Part> value)
 {
-    __shared__ Part kept[BATCH][WARPS][SIZE];
+    __shared__ Part stored[BATCH][WARPS][SIZE];
     Part sum = 0;
     if (!write) {
         #pragma unroll
-        for (unsigned warp = 0; warp < WARPS; ++warp) sum += kept[i][warp][entry];
+        for (unsigned warp = 0; warp < WARPS; ++warp) sum += stored[i][warp][entry];
     } else if ((threadIdx.x & 31u) == 0) {
         #pragma unroll
-        for (unsigned k = 0; k < SIZE; ++k) kept[i][threadIdx.x / 32u][k] = value[k];
+        for (unsigned k = 0; k < SIZE; ++k) stored[i][threadIdx.x / 32u][k] = value[k];
     }
     return sum;
 }

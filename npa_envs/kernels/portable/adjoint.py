@@ -1,4 +1,4 @@
-"""Hand-written adjoints of the perception pass, gathered: no float atomics, a fixed order of sums.
+"""Hand-written backward pass of perception: no float atomics, a fixed order of sums.
 
 Notation: centre i perceives neighbour j at r = x_j - x_i, with smoothing W_ij, spiky gradient
 K_ij = f r and volume v_j = 1 / ρ_j. x̄ (`x_bar`) = dL/dx, the gradient of the loss L: b̄_i by centre
@@ -12,10 +12,11 @@ Positions: r̄_ij = (ρ̄_i + v_j s_j · b̄_i) dW/dr + (dK/dr)ᵀ (v_j Ḡ_iᵀ
 """
 
 from types import SimpleNamespace
+from typing import Any
 
 import warp as wp
 
-from npa_envs.kernels.domain import domain_types, kernel_module
+from npa_envs.kernels.domain import group_types, kernel_module
 from npa_envs.kernels.mathematics import (
     log_scale_adjoint,
     smoothing,
@@ -23,13 +24,13 @@ from npa_envs.kernels.mathematics import (
     spiky_factor,
     spiky_radial_slope,
 )
-from npa_envs.kernels.native_functions import PAIRS, in_ranges, namespace
+from npa_envs.kernels.native_functions import PAIRS, in_ranges
 from npa_envs.kernels.portable.search import make_search
 from npa_envs.kernels.primitives import make_add_scaled, make_wide_load
 from npa_envs.thread_lock import cached_under_lock
 
-CUDA_REGISTERS = 64
-"""Registers per thread in the gathering of state cotangents, which mostly waits for memory."""
+STATE_REGISTERS = 64
+"""Registers per thread of `gather_state_cotangents`, which mostly waits for memory."""
 
 
 @cached_under_lock()
@@ -41,24 +42,28 @@ def adjoint_kernels(
     state_gradient: bool,
     listed: bool = False,
 ) -> SimpleNamespace:
-    """Return the kernels of perception's adjoint; arguments as for `perception_kernels`."""
-    space = domain_types(space_dim, scalar)
-    vector, particle, Domain = space.vector, space.particle, space.Domain
-    group = wp.types.vector(width, scalar)
-    group_gradient = wp.types.matrix((space_dim, width), scalar)
+    """Return the backward kernels of perception by name; arguments as for `perception_kernels`."""
     options = {"on_cpu": on_cpu, "gradient": state_gradient, "listed": listed}
     module = kernel_module("adjoint", space_dim, scalar, width=width, **options)
-    search = make_search(space_dim, scalar, vector, on_cpu, listed)
-    indices = wp.types.vector(search.stride, wp.int32)
-    add_scaled = make_add_scaled(group)
-    load_group = make_wide_load(group)
-    load_gradient = make_wide_load(group_gradient)
+    space = group_types(space_dim, scalar, width)
+    search = make_search(space_dim, scalar, space.vector, on_cpu, listed)
+    return SimpleNamespace(
+        unscale_cotangents=unscaling_kernel(space, module, state_gradient),
+        gather_state_cotangents=state_kernel(space, module, state_gradient, search, listed),
+        gather_density_cotangents=density_kernel(space, module, state_gradient),
+        gather_position_cotangents=position_kernel(space, module),
+    )
+
+
+def unscaling_kernel(space: SimpleNamespace, module: wp.Module, state_gradient: bool) -> wp.Kernel:
+    """Return the kernel that pulls gradients back through the logarithmic scaling."""
+    space_dim, scalar, width, vector = space.space_dim, space.scalar, space.width, space.vector
 
     @wp.func
     def unscaled(
         perception: wp.array2d[scalar], perception_bar: wp.array2d[scalar], row: int, column: int
     ):
-        """Return the cotangent before the logarithmic scaling of the vector from `column` on."""
+        """Return the loss gradient by the vector whose logarithmic scaling begins at `column`."""
         scaled = vector()
         bar = vector()
         for d in range(wp.static(space_dim)):
@@ -67,7 +72,7 @@ def adjoint_kernels(
         return log_scale_adjoint(scaled, bar)
 
     @in_ranges(PAIRS)
-    @wp.kernel(enable_backward=False, module=module)
+    @wp.kernel(module=module)
     def unscale_cotangents(
         range_start: int,
         state_dim: int,
@@ -84,7 +89,7 @@ def adjoint_kernels(
         gradient_bar: wp.array[scalar],
         density_gradient_bar: wp.array[vector],
     ):
-        """Write dL/d(smoothed states) and dL/d(gradients before scaling), from `perception_bar`."""
+        """Write dL/d(smoothed states), dL/d(state gradients) and dL/d(density gradients)."""
         row, channel = wp.tid()
         row += range_start
         if row >= starts[starts.shape[0] - 1] - row_base:
@@ -110,9 +115,21 @@ def adjoint_kernels(
                 bar = density_scale * unscaled(perception, perception_bar, row, column)
             density_gradient_bar[row] = bar
 
+    return unscale_cotangents
+
+
+def state_kernel(
+    space: SimpleNamespace, module: wp.Module, state_gradient: bool, search: Any, listed: bool
+) -> wp.Kernel:
+    """Return the kernel of dL/d(states), which finds rows by `search`."""
+    space_dim, scalar, width, vector = space.space_dim, space.scalar, space.width, space.vector
+    group, indices = space.group, wp.types.vector(search.stride, wp.int32)
+    add_scaled = make_add_scaled(group)
+    load_group, load_gradient = make_wide_load(group), make_wide_load(space.group_gradient)
+
     @wp.func
     def filter_rows(
-        domain: Domain,
+        domain: space.Domain,
         row_positions: wp.array[vector],
         neighbours: wp.array[wp.int32],
         row_of: wp.array[wp.int32],
@@ -120,7 +137,7 @@ def adjoint_kernels(
         first: int,
         end: int,
     ):
-        """Return the rows within eps in a candidate block, from `first` on, and their count."""
+        """Return the rows within eps among a block of candidates from `first`, and their count."""
         near = indices()
         count = wp.int32(0)
         if wp.static(listed):
@@ -135,10 +152,10 @@ def adjoint_kernels(
         return near, count
 
     @in_ranges(PAIRS)
-    @wp.kernel(enable_backward=False, module=module, cuda_max_registers=CUDA_REGISTERS)
+    @wp.kernel(module=module, cuda_max_registers=STATE_REGISTERS)
     def gather_state_cotangents(
         range_start: int,
-        domain: Domain,
+        domain: space.Domain,
         particle_count: int,
         state_dim: int,
         active_offset: int,
@@ -148,21 +165,21 @@ def adjoint_kernels(
         starts: wp.array[wp.int32],
         ends: wp.array[wp.int32],
         neighbours: wp.array[wp.int32],
-        particles: wp.array[particle],
+        particles: wp.array[space.particle],
         original_index: wp.array[wp.int32],
         row_of: wp.array[wp.int32],
         row_positions: wp.array[vector],
         row_kernel_sum: wp.array[vector],
         perception_bar: wp.array2d[scalar],
-        smoothed_bar: wp.array[group],
-        gradient_bar: wp.array[group_gradient],
+        smoothed_bar: wp.array[space.group],
+        gradient_bar: wp.array[space.group_gradient],
         flat_gradient_bar: wp.array[scalar],
         # outputs
         states_bar: wp.array2d[scalar],
     ):
-        """Write the cotangent of each particle's state, summed over the active particles around it.
+        """Write dL/d(state) of each particle, a sum over the active particles around it.
 
-        `flat_gradient_bar`: `gradient_bar` by number. With lists all arrays are in sorted order.
+        `flat_gradient_bar`: `gradient_bar` as scalars. With lists all arrays are in sorted order.
         """
         k, g = wp.tid()
         k += range_start
@@ -210,20 +227,27 @@ def adjoint_kernels(
                             )
                 states_bar[i, channel] = bar
 
+    return gather_state_cotangents
+
+
+def density_kernel(space: SimpleNamespace, module: wp.Module, state_gradient: bool) -> wp.Kernel:
+    """Return the kernel of dL/d(densities)."""
+    space_dim, scalar = space.space_dim, space.scalar
+
     @in_ranges(PAIRS)
-    @wp.kernel(enable_backward=False, module=module)
+    @wp.kernel(module=module)
     def gather_density_cotangents(
         range_start: int,
-        domain: Domain,
+        domain: space.Domain,
         particle_count: int,
         group_count: int,
         starts: wp.array[wp.int32],
-        particles: wp.array[particle],
-        states: wp.array[group],
+        particles: wp.array[space.particle],
+        states: wp.array[space.group],
         original_index: wp.array[wp.int32],
         row_of: wp.array[wp.int32],
-        smoothed_bar: wp.array[group],
-        gradient_bar: wp.array[group_gradient],
+        smoothed_bar: wp.array[space.group],
+        gradient_bar: wp.array[space.group_gradient],
         # outputs
         density_bar: wp.array[scalar],
     ):
@@ -255,11 +279,22 @@ def adjoint_kernels(
                             volume_bar += wp.dot(difference, kernel * gradient_bar[index])
         density_bar[k] = -volume * volume * volume_bar
 
+    return gather_density_cotangents
+
+
+def position_kernel(space: SimpleNamespace, module: wp.Module) -> wp.Kernel:
+    """Return the kernel of dL/dx."""
+    space_dim, scalar, vector = space.space_dim, space.scalar, space.vector
+
     @wp.func
     def pair_bar(
-        domain: Domain, offset: vector, squared: scalar, smoothing_bar: scalar, kernel_bar: vector
+        domain: space.Domain,
+        offset: vector,
+        squared: scalar,
+        smoothing_bar: scalar,
+        kernel_bar: vector,
     ):
-        """Return the cotangent of r = neighbour - centre from the cotangents of W(r) and K(r)."""
+        """Return dL/dr of r = neighbour - centre, from dL/dW(r) and dL/dK(r)."""
         distance = wp.sqrt(squared)
         slope = smoothing_slope(squared, domain.inverse_squared_eps, domain.smoothing_norm)
         factor = spiky_factor(distance, domain.inverse_eps, domain.spiky_norm)
@@ -274,25 +309,25 @@ def adjoint_kernels(
         return offset_bar
 
     @in_ranges(PAIRS)
-    @wp.kernel(enable_backward=False, module=module)
+    @wp.kernel(module=module)
     def gather_position_cotangents(
         range_start: int,
-        domain: Domain,
+        domain: space.Domain,
         particle_count: int,
         group_count: int,
         starts: wp.array[wp.int32],
-        particles: wp.array[particle],
-        states: wp.array[group],
+        particles: wp.array[space.particle],
+        states: wp.array[space.group],
         original_index: wp.array[wp.int32],
         row_of: wp.array[wp.int32],
         density_bar: wp.array[scalar],
-        smoothed_bar: wp.array[group],
-        gradient_bar: wp.array[group_gradient],
+        smoothed_bar: wp.array[space.group],
+        gradient_bar: wp.array[space.group_gradient],
         density_gradient_bar: wp.array[vector],
         # outputs
         positions_bar: wp.array[vector],
     ):
-        """Write dL/dx of each particle, as a neighbour of others plus as a centre."""
+        """Write dL/dx of each particle: its terms as a neighbour of others, and as a centre."""
         k = range_start + wp.tid()
         entry = particles[k]
         position = space.position_of(entry)
@@ -335,4 +370,4 @@ def adjoint_kernels(
                     own_bar -= pair_bar(domain, -offset, squared, as_centre, centre_kernel)
         positions_bar[original_index[k]] = own_bar
 
-    return namespace(locals())
+    return gather_position_cotangents

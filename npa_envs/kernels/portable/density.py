@@ -18,16 +18,15 @@ from npa_envs.thread_lock import cached_under_lock
 
 @cached_under_lock()
 def density_kernels(space_dim: int, scalar: type, on_cpu: bool) -> SimpleNamespace:
-    """Return the kernels of densities and neighbour lists, with one thread per particle."""
+    """Return the kernels `compute_density` and `list_neighbours`, with one thread per particle."""
     space = domain_types(space_dim, scalar)
     vector, particle, Domain = space.vector, space.particle, space.Domain
-    vector_f64 = wp.types.vector(space_dim, wp.float64)
-    search = make_search(space_dim, scalar, particle, on_cpu)
+    vector_f64, search = space.vector_f64, make_search(space_dim, scalar, particle, on_cpu)
     module = kernel_module("density", space_dim, scalar, on_cpu=on_cpu)
 
     @wp.func
     def spiky_f64(domain: Domain, centre: vector, neighbour: vector):
-        """Return the spiky gradient kernel of a pair in float64."""
+        """Return the spiky gradient kernel K of a pair in float64 [1 / length^(D+1)]."""
         kernel = vector_f64()
         r = space.difference_f64(domain, centre, neighbour)
         exact = wp.dot(r, r)
@@ -40,7 +39,7 @@ def density_kernels(space_dim: int, scalar: type, on_cpu: bool) -> SimpleNamespa
         return kernel
 
     @in_ranges(PAIRS)
-    @wp.kernel(enable_backward=False, module=module)
+    @wp.kernel(module=module)
     def compute_density(
         range_start: int,
         domain: Domain,
@@ -57,7 +56,7 @@ def density_kernels(space_dim: int, scalar: type, on_cpu: bool) -> SimpleNamespa
         """Write each particle's position and volume 1 / rho, and density gradients of active ones.
 
         The density gradient cancels almost fully where particles are dense, and rules amplify its
-        rounding error: it stays in float64 up to its scaling, which costs little.
+        rounding error. So it stays in float64 up to its scaling, which costs little.
         """
         k = range_start + wp.tid()
         position = sorted_positions[k]
@@ -99,7 +98,7 @@ def density_kernels(space_dim: int, scalar: type, on_cpu: bool) -> SimpleNamespa
             density_gradients[k] = gradient
 
     @in_ranges(PAIRS)
-    @wp.kernel(enable_backward=False, module=module)
+    @wp.kernel(module=module)
     def list_neighbours(
         range_start: int,
         domain: Domain,
@@ -113,7 +112,7 @@ def density_kernels(space_dim: int, scalar: type, on_cpu: bool) -> SimpleNamespa
     ):
         """Write each particle's number of neighbours, itself included, and their sorted indices.
 
-        Indices are left out if `neighbours` is empty. Those of particle k end at `ends[k]`.
+        No indices are written if `neighbours` is empty. Those of particle k end at `ends[k]`.
         """
         k = range_start + wp.tid()
         position = space.position_of(particles[k])
@@ -146,14 +145,13 @@ def species_kernel(space_dim: int, scalar: type, species_count: int) -> wp.Kerne
     gradients cancel almost fully where particles are dense.
     """
     space = domain_types(space_dim, scalar)
-    vector, Domain = space.vector, space.Domain
-    vector_f64 = wp.types.vector(space_dim, wp.float64)
+    vector, vector_f64, Domain = space.vector, space.vector_f64, space.Domain
     densities_type = wp.types.vector(species_count, wp.float64)
     gradients_type = wp.types.matrix((species_count, space_dim), wp.float64)
     module = kernel_module("species", space_dim, scalar, species=species_count)
 
     @in_ranges(PAIRS)
-    @wp.kernel(enable_backward=False, module=module)
+    @wp.kernel(module=module)
     def gather_species(
         range_start: int,
         domain: Domain,
@@ -169,7 +167,7 @@ def species_kernel(space_dim: int, scalar: type, species_count: int) -> wp.Kerne
         density: wp.array2d[scalar],
         gradient: wp.array3d[scalar],
     ):
-        """Write each particle's scaled densities and density gradients, in the caller's order."""
+        """Write each species' scaled density and density gradient, in the caller's order."""
         k = wp.tid()
         k += range_start
         position = sorted_positions[k]

@@ -1,7 +1,7 @@
-"""Counter-based random draws: Philox4x32-10, and distributions from its 32-bit words.
+"""Counter-based random numbers: Philox4x32-10, and distributions from its 32-bit words.
 
 A word is a function only of a world's key and a counter (element, step, draw, episode), so a
-world's draws depend neither on other worlds nor on the device.
+world's random numbers depend neither on other worlds nor on the device.
 
 Source: Salmon, Moraes, Dror and Shaw, "Parallel random numbers: as easy as 1, 2, 3" (SC 2011).
 """
@@ -33,7 +33,7 @@ def high_word(a: wp.uint32, b: wp.uint32):
 
 @wp.func
 def philox(counter: words, low_key: wp.uint32, high_key: wp.uint32):
-    """Return four random words of a counter and a key, after ten rounds."""
+    """Return four random words, ten rounds of Philox, from a counter and a key."""
     c = counter
     k0 = low_key
     k1 = high_key
@@ -58,7 +58,7 @@ def world_words(
     episodes: wp.array[wp.int32],
     steps: wp.array[wp.int32],
 ):
-    """Return four random words of a world: words 4 `block` to 4 `block` + 3 of its draw `draw`."""
+    """Return four random words of a world: 4 `block` to 4 `block` + 3 of its draw `draw`."""
     key = wp.uint64(keys[world])
     counter = words(
         wp.uint32(block), wp.uint32(steps[world]), wp.uint32(draw), wp.uint32(episodes[world])
@@ -68,7 +68,7 @@ def world_words(
 
 @wp.func
 def joined(high: wp.uint32, low: wp.uint32):
-    """Join two words to 64 bits."""
+    """Return two words joined to 64 bits."""
     return (wp.uint64(high) << wp.uint64(32)) | wp.uint64(low)
 
 
@@ -80,7 +80,7 @@ def fraction_53(high: wp.uint32, low: wp.uint32):
 
 @cached_under_lock()
 def draw_kernel(distribution: str, value_type: type) -> tuple[wp.Kernel, int]:
-    """Return the kernel of a distribution, and how many numbers a thread of it draws.
+    """Return the kernel of a distribution, and how many random numbers a thread of it writes.
 
     "uniform" numbers lie in [0, 1): 24 bits of a word in float32, 53 bits of two in float64.
     "normal" ones are pairs by the Box-Muller transform, in float64: logarithms of devices differ in
@@ -136,8 +136,7 @@ def draw_kernel(distribution: str, value_type: type) -> tuple[wp.Kernel, int]:
         return result
 
     functions = {"uniform": uniform, "normal": normal, "bernoulli": bernoulli, "integers": integers}
-    numbers_of = functions[distribution]
-    name = f"{distribution}_{value_type.__name__}"
+    numbers_of, name = functions[distribution], f"{distribution}_{value_type.__name__}"
 
     @wp.kernel(enable_backward=False, module=wp.get_module(f"npa_envs.kernels.draws_{name}"))
     def draw(
@@ -149,7 +148,7 @@ def draw_kernel(distribution: str, value_type: type) -> tuple[wp.Kernel, int]:
         # outputs
         values: wp.array2d[value_type],
     ):
-        """Write the random numbers of draw `number` in each world."""
+        """Write each world's random numbers of the draw with this `number`."""
         world, block = wp.tid()
         drawn = numbers_of(world_words(world, block, number, keys, episodes, steps), bound)
         for k in range(wp.static(count)):

@@ -15,21 +15,27 @@ from npa_envs.thread_lock import cached_under_lock
 
 @cached_under_lock()
 def equivariance_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
-    """Return the kernels of equivariant rules: mixed vectors, products, steering, and adjoints."""
+    """Return the kernels of equivariant rules: mixed vectors, products, steering, and backward."""
     vector = domain_types(space_dim, scalar).vector
-    numbers = wp.array2d[scalar]
-    vectors = wp.array2d[vector]
     module = kernel_module("equivariance", space_dim, scalar)
-    planar = space_dim == 2
 
     @wp.func
     def turned(u: vector):
         """Return a vector rotated by 90 degrees, in 2D."""
         result = vector()
-        if wp.static(planar):
+        if wp.static(space_dim == 2):
             result[0] = -u[1]
             result[1] = u[0]
         return result
+
+    types = space_dim, scalar, vector, turned, module
+    return SimpleNamespace(**(vars(product_kernels(*types)) | vars(steering_kernels(*types))))
+
+
+def product_kernels(
+    space_dim: int, scalar: type, vector: type, turned: wp.Function, module: wp.Module
+) -> SimpleNamespace:
+    """Return the kernels of mixed vectors and of their products, the network's inputs."""
 
     @wp.func
     def pair_index(a: int, b: int, first: int, count: int):
@@ -37,14 +43,14 @@ def equivariance_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
         return a * (count - first) - a * (a - 1) / 2 + b - a - first
 
     @in_ranges(ELEMENTS)
-    @wp.kernel(enable_backward=False, module=module)
+    @wp.kernel(module=module)
     def mix_vectors(
         range_start: int,
         scalars: int,
-        rows: numbers,
-        mixing: numbers,
+        rows: wp.array2d[scalar],
+        mixing: wp.array2d[scalar],
         # outputs
-        mixed: vectors,
+        mixed: wp.array2d[vector],
     ):
         """Write the mixed vectors of each row: its perceived vectors times the mixing weights."""
         t = range_start + wp.tid()
@@ -59,20 +65,20 @@ def equivariance_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
         mixed[row, a] = total
 
     @in_ranges(ELEMENTS)
-    @wp.kernel(enable_backward=False, module=module)
+    @wp.kernel(module=module)
     def write_inputs(
         range_start: int,
         scalars: int,
         one: int,
         chiral: int,
-        rows: numbers,
-        mixed: vectors,
+        rows: wp.array2d[scalar],
+        mixed: wp.array2d[vector],
         # outputs
-        inputs: numbers,
+        inputs: wp.array2d[scalar],
     ):
-        """Write the network's inputs: scalars, products of mixed vectors, the row's constant, 0.
+        """Write the network's inputs: scalars, products of mixed vectors, the constant, zeros.
 
-        `one` is the column of the constant.
+        `one` is the column of the constant 1 in `rows`.
         """
         # A thread writes the pairs that end with its vector, and some scalars: adjacent threads
         # write adjacent entries.
@@ -97,18 +103,18 @@ def equivariance_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
                 inputs[row, column] = scalar(0.0)
 
     @in_ranges(ELEMENTS)
-    @wp.kernel(enable_backward=False, module=module)
+    @wp.kernel(module=module)
     def pull_back_products(
         range_start: int,
         scalars: int,
         chiral: int,
-        mixed: vectors,
-        inputs_bar: numbers,
-        mixed_bar: vectors,
+        mixed: wp.array2d[vector],
+        inputs_bar: wp.array2d[scalar],
+        mixed_bar: wp.array2d[vector],
         # outputs
-        whole_bar: vectors,
+        whole_bar: wp.array2d[vector],
     ):
-        """Write dL/d(mixed vector): the given `mixed_bar`, plus the part through the products."""
+        """Write dL/d(mixed vectors): `mixed_bar` plus the part through the products."""
         t = range_start + wp.tid()
         count = mixed.shape[1]
         row = t / count
@@ -130,17 +136,17 @@ def equivariance_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
         whole_bar[row, a] = total
 
     @in_ranges(ELEMENTS)
-    @wp.kernel(enable_backward=False, module=module)
+    @wp.kernel(module=module)
     def pull_back_rows(
         range_start: int,
         scalars: int,
-        mixing: numbers,
-        inputs_bar: numbers,
-        mixed_bar: vectors,
+        mixing: wp.array2d[scalar],
+        inputs_bar: wp.array2d[scalar],
+        mixed_bar: wp.array2d[vector],
         # outputs
-        rows_bar: numbers,
+        rows_bar: wp.array2d[scalar],
     ):
-        """Write dL/d(row) of each row of perception, 0 for the constant 1 and the padding."""
+        """Write dL/d(rows of perception), 0 for the constant 1 and the padding."""
         # A thread writes a perceived vector, and some scalars.
         t = range_start + wp.tid()
         count = mixing.shape[0]
@@ -157,18 +163,26 @@ def equivariance_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
             for column in range(scalars + count * wp.static(space_dim), rows_bar.shape[1]):
                 rows_bar[row, column] = scalar(0.0)
 
+    return namespace(locals())
+
+
+def steering_kernels(
+    space_dim: int, scalar: type, vector: type, turned: wp.Function, module: wp.Module
+) -> SimpleNamespace:
+    """Return the kernel that turns gates into displacements, and its backward kernel."""
+
     @in_ranges(ELEMENTS)
-    @wp.kernel(enable_backward=False, module=module)
+    @wp.kernel(module=module)
     def steer(
         range_start: int,
         gate_count: int,
-        output: numbers,
-        mixed: vectors,
+        output: wp.array2d[scalar],
+        mixed: wp.array2d[vector],
         signs: wp.array[scalar],
         # outputs
-        update: numbers,
+        update: wp.array2d[scalar],
     ):
-        """Write updates from a network's gates and state changes, and zeros in further columns."""
+        """Write updates: displacements, sums of mixed vectors times gates; state changes; zeros."""
         t = range_start + wp.tid()
         # Directions come first, so that adjacent threads take the same branch.
         directions = update.shape[0] * wp.static(space_dim)
@@ -196,19 +210,19 @@ def equivariance_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
         update[row, column] = value
 
     @in_ranges(ELEMENTS)
-    @wp.kernel(enable_backward=False, module=module)
+    @wp.kernel(module=module)
     def pull_back_steering(
         range_start: int,
         gate_count: int,
-        output: numbers,
-        mixed: vectors,
+        output: wp.array2d[scalar],
+        mixed: wp.array2d[vector],
         signs: wp.array[scalar],
-        update_bar: numbers,
+        update_bar: wp.array2d[scalar],
         # outputs
-        output_bar: numbers,
-        mixed_bar: vectors,
+        output_bar: wp.array2d[scalar],
+        mixed_bar: wp.array2d[vector],
     ):
-        """Write dL/d(output) and dL/d(mixed vector) from `update_bar` = dL/d(update)."""
+        """Write dL/d(output) and dL/d(mixed vectors) from `update_bar` = dL/d(update)."""
         t = range_start + wp.tid()
         width = output.shape[1]
         row = t / width

@@ -10,7 +10,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from npa_envs.kernels.domain import domain_types, kernel_module
+from npa_envs.kernels.domain import group_types, kernel_module
 from npa_envs.kernels.mathematics import (
     log_scaled,
     make_corrected,
@@ -23,7 +23,7 @@ from npa_envs.kernels.portable.search import make_search
 from npa_envs.kernels.primitives import make_add_scaled, make_wide_load
 from npa_envs.thread_lock import cached_under_lock
 
-CUDA_REGISTERS = 128
+PERCEIVE_REGISTERS = 128
 """Registers per thread of the perception pass: more threads at a time are worth a few spills."""
 
 
@@ -37,18 +37,15 @@ def perception_kernels(
     moment_inverse: str | None,
     listed: bool = False,
 ) -> SimpleNamespace:
-    """Return the kernels of perception vectors and fields, for groups of `width` channels.
+    """Return the kernels `perceive` and `gather_fields`, for groups of `width` channels.
 
     Without `state_gradient`, or without its correction by a `moment_inverse`, they leave out the
-    sums that only these need. `listed`: they read neighbour lists instead of cells.
+    sums that only these need. If `listed`, they read neighbour lists instead of cells.
     """
     moment_correction = moment_inverse is not None
-    space = domain_types(space_dim, scalar)
+    space = group_types(space_dim, scalar, width)
     vector, particle, Domain = space.vector, space.particle, space.Domain
-    vector_f64 = wp.types.vector(space_dim, wp.float64)
-    group = wp.types.vector(width, scalar)
-    group_gradient = wp.types.matrix((space_dim, width), scalar)
-    square = wp.types.matrix((space_dim, space_dim), scalar)
+    group, group_gradient, square = space.group, space.group_gradient, space.square
     name = perception_module_name(state_gradient, moment_inverse)
     options = {"width": width, "on_cpu": on_cpu, "listed": listed}
     module = kernel_module(name, space_dim, scalar, **options)
@@ -114,7 +111,7 @@ def perception_kernels(
         return result
 
     @in_ranges(PAIRS)
-    @wp.kernel(enable_backward=False, module=module, cuda_max_registers=CUDA_REGISTERS)
+    @wp.kernel(module=module, cuda_max_registers=PERCEIVE_REGISTERS)
     def perceive(
         range_start: int,
         domain: Domain,
@@ -134,7 +131,7 @@ def perception_kernels(
         flat_states: wp.array2d[scalar],
         row_index: wp.array[wp.int32],
         row_destination: wp.array[wp.int32],
-        density_gradients: wp.array[vector_f64],
+        density_gradients: wp.array[space.vector_f64],
         # outputs
         perception: wp.array2d[scalar],
         row_kernel_sum: wp.array[vector],
@@ -190,7 +187,7 @@ def perception_kernels(
                 perception[to, padding] = wp.where(padding == column, scalar(1.0), scalar(0.0))
 
     @in_ranges(PAIRS)
-    @wp.kernel(enable_backward=False, module=module)
+    @wp.kernel(module=module)
     def gather_fields(
         range_start: int,
         domain: Domain,

@@ -15,7 +15,7 @@ CONTINUE, LIMIT_LOSS, END = 0, 1, 2
 """Effect of divergence on an episode: none; its loss is at least the first loss; it also ends."""
 
 
-@wp.kernel(enable_backward=False, module=native.module("npa_envs.kernels.episodes"))
+@wp.kernel(module=native.module("npa_envs.kernels.episodes"))
 def update_episodes(
     part_count: int,
     last_step: int,

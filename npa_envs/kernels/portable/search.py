@@ -10,6 +10,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from npa_envs.kernels.domain import domain_types
+from npa_envs.kernels.native_functions import namespace
 from npa_envs.thread_lock import cached_under_lock
 
 FILTER_BLOCK = 32
@@ -33,14 +34,13 @@ def make_search(
     `listed`: `neighbours` holds the neighbours of each particle, up to its `ends`.
     """
     space = domain_types(space_dim, scalar)
-    vector, Domain = space.vector, space.Domain
-    cell_vector = wp.types.vector(space_dim, wp.int32)
+    vector, cell_vector, Domain = space.vector, space.cell_vector, space.Domain
     stride = FILTER_BLOCK if on_cpu else 1
     indices = wp.types.vector(stride, wp.int32)
 
     @wp.func
     def run_count(domain: Domain, cell: cell_vector):
-        """Return the number of runs of cells around a cell; 1 for a neighbour list."""
+        """Return the number of runs of cells around a cell; with neighbour lists 1."""
         count = wp.int32(1)
         if wp.static(not listed):
             count = space.segment_count(domain, cell)
@@ -94,6 +94,4 @@ def make_search(
                 count += wp.where(wp.dot(offset, offset) < domain.squared_eps, 1, 0)
         return near, count
 
-    return SimpleNamespace(
-        stride=stride, run_count=run_count, run_range=run_range, filter_near=filter_near
-    )
+    return namespace(locals(), stride=stride)

@@ -1,4 +1,4 @@
-"""Cell lists by counting sort, in an order that depends on the particles alone.
+"""Cell lists by counting sort, in an order that depends only on the particles.
 
 Particles are sorted by world, then cell, then index. A row of cells is contiguous, so that the
 neighbourhood of a cell is a few contiguous runs of particles. The particles whose update mask is
@@ -24,14 +24,14 @@ from npa_envs.thread_lock import cached_under_lock
 
 @cached_under_lock()
 def sort_kernels(space_dim: int, scalar: type, width: int) -> SimpleNamespace:
-    """Return the kernels that sort particles by cell."""
+    """Return the kernels that sort particles by cell: three in a row, or only `sort_worlds`."""
     space = domain_types(space_dim, scalar)
     vector, Domain = space.vector, space.Domain
     group = wp.types.vector(width, scalar)
     read_channels = make_read_channels(group)
     module = kernel_module("sort", space_dim, scalar, width=width)
 
-    @wp.kernel(enable_backward=False, module=module)
+    @wp.kernel(module=module)
     def count_cells(
         domain: Domain,
         positions: wp.array[vector],
@@ -53,7 +53,7 @@ def sort_kernels(space_dim: int, scalar: type, width: int) -> SimpleNamespace:
         if mask.shape[0] > 0 and mask[i] != wp.uint8(0):
             wp.atomic_add(counts, active_offset + index + 1, 1)
 
-    @wp.kernel(enable_backward=False, module=module)
+    @wp.kernel(module=module)
     def place_by_arrival(
         mask: wp.array[wp.uint8],
         cell: wp.array[wp.int32],
@@ -76,7 +76,7 @@ def sort_kernels(space_dim: int, scalar: type, width: int) -> SimpleNamespace:
         wide_store(arrived, target, wp.vec2i(entry, c))
 
     @in_ranges(PARTICLES)
-    @wp.kernel(enable_backward=False, module=module)
+    @wp.kernel(module=module)
     def order_particles(
         range_start: int,
         positions: wp.array[vector],
@@ -129,7 +129,7 @@ def sort_kernels(space_dim: int, scalar: type, width: int) -> SimpleNamespace:
                 sorted_states[target * group_count + g] = state
 
     @in_ranges(WORLDS)
-    @wp.kernel(enable_backward=False, module=module)
+    @wp.kernel(module=module)
     def sort_worlds(
         range_start: int,
         domain: Domain,
@@ -230,7 +230,7 @@ def give_rows(space_dim: int, scalar: type) -> wp.Kernel:
     """Return the kernel that numbers the rows of the active particles of sorted worlds."""
     vector = wp.types.vector(space_dim, scalar)
 
-    @wp.kernel(enable_backward=False, module=kernel_module("rows", space_dim, scalar))
+    @wp.kernel(module=kernel_module("rows", space_dim, scalar))
     def give_rows(
         total: int,
         active_offset: int,
@@ -246,8 +246,8 @@ def give_rows(space_dim: int, scalar: type) -> wp.Kernel:
         """Write the row of each particle, the particle of each row, and starts of cells and rows.
 
         It does so for several steps of the same sorted worlds; a step has a thread for each
-        particle or start, whichever are more. `active_before` is the cumulative number of active
-        particles over all steps, up to and with each particle.
+        particle or start, whichever are more. `active_before` is the number of active particles up
+        to and with each particle, accumulated over all steps.
         """
         wait_for_previous_kernel()
         step, t = wp.tid()

@@ -38,12 +38,12 @@ MOVED_TOGETHER = 32
 @cached_under_lock()
 def motion_functions(space_dim: int, scalar: type) -> SimpleNamespace:
     """Return the Warp functions that move a position and keep it within the boundary."""
-    vector = domain_types(space_dim, scalar).vector
-    vector_f64 = wp.types.vector(space_dim, wp.float64)
+    space = domain_types(space_dim, scalar)
+    vector, vector_f64 = space.vector, space.vector_f64
 
     @wp.func
     def displaced(position: vector, factor: wp.float64, direction: vector_f64):
-        """Return a position plus factor times direction; in float64, to round it only once."""
+        """Return position + factor * direction; in float64, to round it only once."""
         result = position
         for d in range(wp.static(space_dim)):
             result[d] = scalar(wp.float64(position[d]) + factor * direction[d])
@@ -67,9 +67,9 @@ def motion_functions(space_dim: int, scalar: type) -> SimpleNamespace:
 
 @cached_under_lock()
 def update_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
-    """Return the kernel that moves particles and changes states by updates, and its adjoint."""
-    vector = domain_types(space_dim, scalar).vector
-    vector_f64 = wp.types.vector(space_dim, wp.float64)
+    """Return `apply_update`, which moves particles and changes states, and its backward kernel."""
+    space = domain_types(space_dim, scalar)
+    vector, vector_f64 = space.vector, space.vector_f64
     channels = wp.types.vector(THREAD_CHANNELS, scalar)
     motion = motion_functions(space_dim, scalar)
     load_scalar = make_wide_load(scalar)
@@ -78,7 +78,7 @@ def update_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
     module = kernel_module("update", space_dim, scalar)
 
     @in_ranges(ELEMENTS)
-    @wp.kernel(enable_backward=False, module=module)
+    @wp.kernel(module=module)
     def apply_update(
         range_start: int,
         largest_step: wp.float64,
@@ -99,7 +99,7 @@ def update_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
         new_states: wp.array[scalar],
         new_path_length: wp.array[scalar],
     ):
-        """Write positions, states and path lengths, updated where a particle has a row."""
+        """Write new positions, states and path lengths; a particle without a row keeps its own."""
         wait_for_previous_kernel()
         # Of the threads of a group of particles, the first move one particle each, and the others
         # change some channels each.
@@ -152,7 +152,7 @@ def update_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
                     new_states[states_begin + k] = value
 
     @in_ranges(ELEMENTS)
-    @wp.kernel(enable_backward=False, module=module)
+    @wp.kernel(module=module)
     def pull_back_update(
         range_start: int,
         largest_step: scalar,
@@ -171,7 +171,7 @@ def update_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
         # outputs
         update_bar: wp.array[scalar],
     ):
-        """Write dL/d(update) of every row, 0 beyond the last active row."""
+        """Write dL/d(update) of every row; 0 beyond the last active row."""
         wait_for_previous_kernel()
         allow_next_launch()
         # A thread writes some adjacent columns of a row.
@@ -218,8 +218,8 @@ def update_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
 @cached_under_lock()
 def action_kernel(space_dim: int, scalar: type) -> wp.Kernel:
     """Return the kernel that moves particles and changes states by actions."""
-    vector = domain_types(space_dim, scalar).vector
-    vector_f64 = wp.types.vector(space_dim, wp.float64)
+    space = domain_types(space_dim, scalar)
+    vector, vector_f64 = space.vector, space.vector_f64
     channels = wp.types.vector(THREAD_CHANNELS, scalar)
     motion = motion_functions(space_dim, scalar)
     read_states = make_read_at(channels, 16)
@@ -263,7 +263,7 @@ def action_kernel(space_dim: int, scalar: type) -> wp.Kernel:
         return motion.displaced(position, step, action)
 
     @in_ranges(ELEMENTS)
-    @wp.kernel(enable_backward=False, module=kernel_module("actions", space_dim, scalar))
+    @wp.kernel(module=kernel_module("actions", space_dim, scalar))
     def apply_actions(
         range_start: int,
         particle_count: int,
@@ -286,7 +286,7 @@ def action_kernel(space_dim: int, scalar: type) -> wp.Kernel:
         # outputs
         diverged: wp.array[wp.uint8],
     ):
-        """Apply the actions of active particles, and mark worlds in which a value was clipped."""
+        """Apply actions of active particles in place; `diverged`: worlds with clipped values."""
         wait_for_previous_kernel()
         # All loads are issued before any value is used, as the kernel waits for memory.
         chunks = (state_dim + wp.static(THREAD_CHANNELS - 1)) / wp.static(THREAD_CHANNELS)
@@ -371,11 +371,8 @@ def action_kernel(space_dim: int, scalar: type) -> wp.Kernel:
     return apply_actions
 
 
-QUAD = 4
-"""Values that a thread reads at once."""
-
-VALUES_PER_THREAD = 8
-"""Values that a thread checks."""
+QUAD, VALUES_PER_THREAD = 4, 8
+"""Values that a thread of `flag_not_finite` reads at once, and values that it checks."""
 
 
 @cached_under_lock()
@@ -384,7 +381,7 @@ def flag_not_finite(scalar: type) -> wp.Kernel:
     module = native.module(f"npa_envs.kernels.finite_{scalar_name(scalar)}")
     read_quad = make_read_at(wp.types.vector(QUAD, scalar), 16)
 
-    @wp.kernel(enable_backward=False, module=module)
+    @wp.kernel(module=module)
     def flag_not_finite(
         thread_count: int,
         values: wp.array[scalar],

@@ -25,7 +25,7 @@ def mean_kernels(scalar: type, lanes: int) -> SimpleNamespace:
     module = native.module(f"npa_envs.kernels.worlds_{scalar_name(scalar)}_l{lanes}")
     lane_sum = make_lane_sum(wp.float64, lanes, whole_warps=True)
 
-    @wp.kernel(enable_backward=False, module=module)
+    @wp.kernel(module=module)
     def sum_chunks(
         values: wp.array3d[scalar],
         # outputs
@@ -42,7 +42,7 @@ def mean_kernels(scalar: type, lanes: int) -> SimpleNamespace:
         if lane == 0:
             partial_sums[world, chunk, k] = total
 
-    @wp.kernel(enable_backward=False, module=module)
+    @wp.kernel(module=module)
     def average_sums(
         value_count: wp.float64,
         partial_sums: wp.array3d[wp.float64],
