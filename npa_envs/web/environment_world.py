@@ -61,7 +61,7 @@ def make_environment(
 
 
 class EnvironmentWorld(LiveWorld):
-    """The world of an environment whose actions a policy chooses, as `make_environment` makes both."""
+    """The world of an environment whose actions a policy chooses; `make_environment` makes both."""
 
     def __init__(self, env: Any, policy: Callable[[Any], Any], *, seed: int = 0) -> None:
         super().__init__(seed)
