@@ -67,7 +67,7 @@ def evaluate_policy(env: Any, policy: Callable[[Any], Any], seeds: Iterable[int]
     Raises:
         NPAError: Seeds are missing or wrong, or the environment is not of this library.
     """
-    # `_run` checks environments in other processes by their infos.
+    # `_run_many` checks environments in other processes by their infos.
     in_processes = isinstance(getattr(env, "unwrapped", None), AsyncVectorEnv)
     worlds = None if in_processes else unwrapped(env).worlds
     if not (hasattr(env, "num_envs") or isinstance(env, gymnasium.Env)):
@@ -81,7 +81,7 @@ def evaluate_policy(env: Any, policy: Callable[[Any], Any], seeds: Iterable[int]
     seeds = checked_seeds("seeds", seeds)
     policy = bound_to(env, policy)
     single = isinstance(env, gymnasium.Env)
-    run, count = (_run_single, 1) if single else (_run, env.num_envs)
+    run, count = (_run_single, 1) if single else (_run_many, env.num_envs)
     batches = [seeds[k : k + count] for k in range(0, len(seeds), count)]
     results = [run(env, policy, [*batch, *batch[-1:] * (count - len(batch))]) for batch in batches]
     returns, start_losses, final_losses, steps, endings = (
@@ -110,7 +110,7 @@ def bound_to(env: Any, policy: Callable[[Any], Any]) -> Callable[[Any], Any]:
     return policy if make is None else make(env)
 
 
-def _run(env: Any, policy: Callable[[Any], Any], seeds: list[int]) -> tuple[NDArray[Any], ...]:
+def _run_many(env: Any, policy: Callable[[Any], Any], seeds: list[int]) -> tuple[NDArray[Any], ...]:
     """Return the fields of `Episodes` for each world's first episode after a reset with `seeds`."""
     observation, infos = env.reset(seed=seeds)
     if "loss" not in infos:
@@ -118,7 +118,7 @@ def _run(env: Any, policy: Callable[[Any], Any], seeds: list[int]) -> tuple[NDAr
             f"env must contain environments of npa_envs, got others in {type(env).__name__}: make "
             "it with gymnasium.make_vec('npa/Morphogenesis2D-v0', num_envs=8)"
         )
-    start_losses = _host(infos["loss"])
+    start_losses = _as_numpy(infos["loss"])
     returns, final_losses = np.zeros(len(seeds)), np.zeros(len(seeds))
     steps = np.zeros(len(seeds), dtype=np.int64)
     endings = np.full(len(seeds), None, dtype=object)
@@ -126,13 +126,13 @@ def _run(env: Any, policy: Callable[[Any], Any], seeds: list[int]) -> tuple[NDAr
     resets_itself = env.metadata.get("autoreset_mode") is not AutoresetMode.DISABLED
     while running.any():
         observation, reward, terminated, truncated, infos = env.step(policy(observation))
-        returns[running] += _host(reward)[running]
+        returns[running] += _as_numpy(reward)[running]
         steps[running] += 1
-        ended = (_host(terminated) | _host(truncated)).astype(bool)
+        ended = (_as_numpy(terminated) | _as_numpy(truncated)).astype(bool)
         over = running & ended
         if over.any():
             final = infos.get("final_info", infos)
-            final_losses[over] = _host(final["loss"])[over]
+            final_losses[over] = _as_numpy(final["loss"])[over]
             for k in np.flatnonzero(over):
                 info = {name: final[name][k] for name in _REASONS & final.keys()}
                 endings[k] = _ending(info, bool(terminated[k]))
@@ -176,7 +176,7 @@ def _step_limit(env: Any) -> int | None:
     return limit if limit is not None and limit > 0 else None
 
 
-def _host(value: Any) -> NDArray[Any]:
+def _as_numpy(value: Any) -> NDArray[Any]:
     """Return a tensor or an array as a NumPy array, float64 unless bool."""
     array = value.cpu().numpy() if isinstance(value, torch.Tensor) else np.asarray(value)
     return array if array.dtype == bool else array.astype(np.float64)

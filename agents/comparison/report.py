@@ -65,7 +65,7 @@ def write_pictures(records: Sequence[RunRecord], folder: Path) -> list[str]:
 
     def curves() -> dict[str, bytes]:
         tasks = dict.fromkeys(record.job.task for record in records)
-        return {task: _picture([r for r in records if r.job.task == task]) for task in tasks}
+        return {task: _curve_plot([r for r in records if r.job.task == task]) for task in tasks}
 
     return [*strips, *write_plots(curves, folder / "curves_*.png", "curves")]
 
@@ -277,7 +277,7 @@ def mean_curve(records: Sequence[RunRecord], across: str) -> Curve | None:
     return grid, values.mean(axis=0), error
 
 
-def _picture(records: Sequence[RunRecord]) -> bytes:
+def _curve_plot(records: Sequence[RunRecord]) -> bytes:
     axes = [axis for axis in BUDGET_KINDS if any(record.job.axis == axis for record in records)]
     names = {}
     for method in dict.fromkeys(record.job.method for record in records):
@@ -291,7 +291,7 @@ def _picture(records: Sequence[RunRecord]) -> bytes:
                 method_records = [
                     r for r in records if (r.job.axis, r.job.method) == (axis, method)
                 ]
-                _draw(panel, mean_curve(method_records, across), f"C{number}", name)
+                _draw_curve(panel, mean_curve(method_records, across), f"C{number}", name)
             panel.set(xlabel=label, ylabel="return of held-out episodes")
             panel.set_title(HEADINGS[axis], fontsize=9, loc="left")
             panel.grid(alpha=0.3)
@@ -300,7 +300,7 @@ def _picture(records: Sequence[RunRecord]) -> bytes:
     return png(figure)
 
 
-def _draw(panel: Any, drawn: Curve | None, colour: str, name: str) -> None:
+def _draw_curve(panel: Any, drawn: Curve | None, colour: str, name: str) -> None:
     if drawn is None:
         panel.plot([], [], color=colour, label=name)
         return

@@ -335,10 +335,10 @@ def run_jobs(
     idle: list[subprocess.Popen[bytes]] = []
 
     def start(unfinished: Sequence[RunProcess]) -> RunProcess | None:
-        ahead = {*waiting, *(one.job for one in unfinished)}
+        pending = {*waiting, *(one.job for one in unfinished)}
         for job in waiting:
             teacher = plan.teacher(job)
-            if teacher not in ahead:
+            if teacher not in pending:
                 waiting.remove(job)
                 target = folder / job.folder
                 temporary = target.parent / f".{target.name}.{secrets.token_hex(4)}"
@@ -353,11 +353,11 @@ def run_jobs(
         return None
 
     def finished(one: RunProcess) -> None:
-        again = shares_process(plan, one.job)
-        if not again:
+        reusable = shares_process(plan, one.job)
+        if not reusable:
             one.process.communicate()
         record = _finish(one, folder)
-        if again and record.status in MEASURED and one.process.poll() is None:
+        if reusable and record.status in MEASURED and one.process.poll() is None:
             idle.append(one.process)
         else:
             one.process.communicate()

@@ -145,7 +145,7 @@ class Progress:
         self._points_due = 0
         self._on_point, self._on_stop = on_point, on_stop
         self._envs: Any = None
-        self._begin: float | None = None
+        self._clock_start: float | None = None
         self._seconds = self._agreed_seconds = 0.0
         self._last_event: torch.cuda.Event | None = None
         self._resumptions = 0
@@ -214,11 +214,11 @@ class Progress:
 
     def start(self, policy: RuleSet | Callable[[Any], Any]) -> None:
         """Evaluate the rules or the policy before any learning, unless resumed; start the clock."""
-        if self._begin is not None:
+        if self._clock_start is not None:
             raise NPAError("progress must start once, got a second start: make one for each run")
         if not self.log:
             self._evaluate(policy)
-        self._begin = time.perf_counter()
+        self._clock_start = time.perf_counter()
         self._agree_on_time()
 
     @property
@@ -266,17 +266,17 @@ class Progress:
         """Stop the clock within a block, which all processes must enter."""
         self._synchronise()
         self._agree_on_time()
-        self._seconds, self._begin = self._agreed_seconds, None
+        self._seconds, self._clock_start = self._agreed_seconds, None
         yield
-        self._begin = time.perf_counter()
+        self._clock_start = time.perf_counter()
 
     def _agree_on_time(self) -> None:
-        assert self._begin is not None, "the clock runs"
-        seconds = self._seconds + (time.perf_counter() - self._begin)
+        assert self._clock_start is not None, "the clock runs"
+        seconds = self._seconds + (time.perf_counter() - self._clock_start)
         self._agreed_seconds = self.processes.broadcast(seconds)
 
     def _check_started(self, caller: str) -> None:
-        if self._begin is None:
+        if self._clock_start is None:
             raise NPAError(f"{caller} needs a start: call progress.start(rules) after the set-up")
 
     def _evaluate(self, policy: RuleSet | Callable[[Any], Any]) -> None:
