@@ -1,4 +1,4 @@
-"""Vectors of equivariant rules: mixed vectors, rotation-invariant products, steering.
+"""Vectors of equivariant rules: mixed, rotation-invariant products, displacements from gates.
 
 `npa_envs/ops/equivariance.py` has the formulas, `kernels/portable/__init__.py` the arguments. A
 thread computes a few numbers of a row.
@@ -15,7 +15,7 @@ from npa_envs.thread_lock import cached_under_lock
 
 @cached_under_lock()
 def equivariance_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
-    """Return the kernels of equivariant rules: mixed vectors, products, steering, and backward."""
+    """Return the forward and backward kernels of equivariant rules, by name."""
     vector = domain_types(space_dim, scalar).vector
     module = kernel_module("equivariance", space_dim, scalar)
 
