@@ -171,7 +171,7 @@ class Window:
             )
 
     def show(self, frame: Frame) -> None:
-        """Show a frame, uint8, [H, W, 3], and wait as `fps` requires; nothing if it is closed."""
+        """Show a frame, uint8, [H, W, 3], and wait as `fps` requires; do nothing if closed."""
         (pixels,) = checked_frames([frame])
         if self._surface is None:
             return
