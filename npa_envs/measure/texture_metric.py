@@ -24,9 +24,8 @@ PATCH = 24
 DIRECTIONS = 64
 """Number of random directions that patches are projected on."""
 BANDS = 7
-"""Number of bands of the wave number, up to half a wave per pixel."""
+"""Number of bands of the wave number, `BAND_RATIO` wide each, up to half a wave per pixel."""
 BAND_RATIO = math.sqrt(2.0)
-"""Highest wave number of a band / lowest."""
 ORIENTATIONS = 8
 """Number of orientations of waves in half a turn."""
 PAIR_DISTANCES = (1, 2, 4, 6, 9, 13, 19, 28)

@@ -110,8 +110,7 @@ BOUNDS = {
 - `overflow`: mean |s - clip(s, -1, 1)|, how far states lie outside of [-1, 1].
 - `largest_state`: the largest |s|.
 - `energy`: mean over particles of a step's |Δx|²/ε² + mean Δs² / that of the settled world.
-- `drift`: distance between the centroids of the world and of the settled one / extent of the
-  settled one; only for moving particles in open space.
+- `drift`: distance of the centroid from the settled one's / settled extent; in open space only.
 """
 
 
