@@ -110,7 +110,7 @@ def measured(trainer: Trainer, size: str, last_step: int = LAST) -> dict[str, An
     """Return tables of a trained rule: growth; at a `last_step` of `LAST` healing; its pool."""
     task: Any = trainer.task
     rule = trainer.saved_rule
-    device = trainer.config.device
+    worlds: dict[str, Any] = {"seeds": SEEDS, "device": trainer.config.device}
     steps = (4, 8) if size == "tiny" else (*STEPS, LAST)
     steps = tuple(step for step in steps if step <= last_step)
     grow, heal = (8, 8) if size == "tiny" else (1024, 500)
@@ -118,13 +118,11 @@ def measured(trainer: Trainer, size: str, last_step: int = LAST) -> dict[str, An
     # A rule may diverge; then what came before is kept.
     while steps and not rows:
         with contextlib.suppress(NPAError):
-            rows = evaluate(rule, task, checkpoints=steps, seeds=SEEDS, device=device)
+            rows = evaluate(rule, task, checkpoints=steps, **worlds)
         steps = steps[:-1]
     with contextlib.suppress(NPAError):
         if last_step == LAST:
-            healed = healing(
-                rule, task, grow_steps=grow, heal_steps=heal, seeds=SEEDS, device=device
-            )
+            healed = healing(rule, task, grow_steps=grow, heal_steps=heal, **worlds)
     if trainer.config.device.startswith("cuda"):
         release_captures()
     found = {"growth": [asdict(row) for row in rows], "healing": [asdict(row) for row in healed]}

@@ -33,7 +33,7 @@ Row = TypeVar("Row")
 
 
 class Record(Generic[Row]):
-    """The results of a measurement (rows) and the facts of its run, in a JSON file if `path` is."""
+    """Results of a measurement (rows) and the facts of its run, with their JSON file, if any."""
 
     command: str
     """The command of `npa-envs` that writes such records, for messages of errors."""

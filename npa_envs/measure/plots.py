@@ -41,7 +41,6 @@ def write_plots(draw: Callable[[], Mapping[str, bytes]], path: Path, what: str) 
 
 def new_figure(rows: int, columns: int, size: tuple[float, float]) -> tuple[Any, Any]:
     """Return a figure of `size` [inches], and its panels (matplotlib's Axes), [rows, columns]."""
-    # Without pyplot, which keeps figures in a global state.
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=size, layout="constrained")

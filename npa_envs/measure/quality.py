@@ -74,7 +74,7 @@ class HealingRow:
     """Mean losses of grown worlds `before` a damage, right `after` it, and at the `end` of the run.
 
     `steps_to_heal`: steps until the mean loss is at most `HEALED` times `before`; None: never.
-    `worlds_healed`: number of worlds whose own loss was so at some step, and did not diverge.
+    `worlds_healed`: number of worlds whose own loss was that low at some step, and did not diverge.
     """
 
     damage: str
@@ -183,7 +183,7 @@ def healing(
 
 
 def _healing_row(damage: str, before: Tensor, steps: Sequence[int], losses: Tensor) -> HealingRow:
-    """Return the row of losses [B] `before` a damage, and [len(steps), B] at `steps` after it."""
+    """Return a row from losses [B] `before` a damage, and [len(steps), B] at `steps` after it."""
     diverged = ~(losses[-1] <= DIVERGED_FACTOR * before)
     mean_healed = ((losses.mean(1) <= HEALED * before.mean()) & ~diverged.all()).tolist()
     healed = [step for step, is_healed in zip(steps, mean_healed, strict=True) if is_healed]
@@ -232,7 +232,7 @@ class ChangeRow:
     """Votes of all clouds `steps` steps after their particles were cut off or moved (`change`).
 
     Fractions in [0, 1]: `majority`, of clouds whose majority votes for the class after the change;
-    `particle`, of particles that do; `majority_before`, of clouds by the class before it.
+    `particle`, of particles that do; `majority_before`, of clouds that do so for the former class.
     """
 
     change: str

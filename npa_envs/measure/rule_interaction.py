@@ -158,7 +158,7 @@ class RuleUnderTest(NamedTuple):
 class Encounters:
     """Grows pairs of rules together, and each one without the other, from the same random seeds.
 
-    Rules that cannot share a world raise NPAError. `progress` is called with new steps done.
+    Rules that cannot share a world raise NPAError. `progress` gets the number of new steps.
     """
 
     def __init__(
@@ -190,9 +190,9 @@ class Encounters:
     def meet(
         self, first: RuleUnderTest, second: RuleUnderTest
     ) -> tuple[list[InteractionRow], dict[str, NDArray[np.uint8]]]:
-        """Grow `first` together with `second`; return the row of `first` at each setting.
+        """Grow `first` together with `second`; return a row about `first` for each setting.
 
-        Also returns pictures [R, R, 3] of first worlds by captions, len(FRAME_TIMES) for each.
+        Also returns pictures of the first worlds at `FRAME_TIMES`, uint8, [R, R, 3], by caption.
         """
         rows, frames, settings = [], {}, self.settings
         for factor, ratio, distance in itertools.product(
@@ -233,7 +233,7 @@ class Encounters:
 
     def _picture(self, worlds: Particles, distance: float) -> NDArray[np.uint8]:
         """Return a picture of the first world, centred between the two start positions."""
-        return draw_worlds(
+        picture: NDArray[np.uint8] = draw_worlds(
             worlds.x[:1],
             worlds.s[:1],
             centre=(0.5 * distance, 0.0),
@@ -241,6 +241,7 @@ class Encounters:
             pixel_size=0.5 * math.sqrt(4.0 / self.particle_count),
             half_width=1.2 + 0.5 * distance,
         )[0]
+        return picture
 
     def _grow(
         self,
@@ -308,7 +309,7 @@ class InteractionRecord(Record[InteractionRow]):
 
 
 def interaction_map(rows: Sequence[InteractionRow]) -> bytes:
-    """Return a PNG with a heat map for each setting: the loss of rule A (row) with B / without."""
+    """Return a PNG of a heat map for each setting: the loss of rule A (row) with B / without B."""
     names = list(dict.fromkeys([row.rule for row in rows] + [row.beside for row in rows]))
     cells: dict[str, dict[tuple[str, str], float]] = {}
     for row in rows:

@@ -24,9 +24,8 @@ PATCH = 24
 DIRECTIONS = 64
 """Number of random directions that patches are projected on."""
 BANDS = 7
-"""Number of bands of the wave number, up to half a wave per pixel."""
+"""Number of bands of the wave number, `BAND_RATIO` wide each, up to half a wave per pixel."""
 BAND_RATIO = math.sqrt(2.0)
-"""Highest wave number of a band / lowest."""
 ORIENTATIONS = 8
 """Number of orientations of waves in half a turn."""
 PAIR_DISTANCES = (1, 2, 4, 6, 9, 13, 19, 28)
@@ -94,7 +93,7 @@ class TextureMetric:
 
     @torch.no_grad()
     def __call__(self, pictures: Tensor) -> Tensor:
-        """Return the three distances of `TextureRow` for each picture, float64, [B, 3]."""
+        """Return patches, spectra, colours (`TextureRow`) of each picture, float64, [B, 3]."""
         if pictures.shape[1:] != self._task.target_picture.shape:
             raise NPAError(
                 f"pictures must have shape [B, R, R, 4] with R as the target's "
@@ -130,7 +129,7 @@ class TextureMetric:
         return quantiles(projected.flatten(1), count)
 
     def _amplitudes(self, image: Tensor) -> Tensor:
-        """Return roots of an image's power by channel and by bin of waves, [4, bins]."""
+        """Return the square root of the power in each channel and each bin of waves, [4, bins]."""
         flat = (image - image.mean(dim=(2, 3), keepdim=True)) * self._window
         power = torch.fft.fft2(flat, norm="forward").abs().square() / self._window.square().mean()
         sums: Tensor = power[0].flatten(1) @ self._bins
@@ -161,12 +160,13 @@ class TextureMetric:
 def _patch_filters(
     side: int, resolution: int, generator: torch.Generator, device: torch.device
 ) -> Tensor:
-    """Return spectra that project an image's patches on random directions, [DIRECTIONS, 4, ...]."""
+    """Return spectra of filters that project patches on random directions, [DIRECTIONS, 4, ...]."""
     directions = torch.randn(DIRECTIONS, 4, side, side, generator=generator).double()
     directions /= directions.flatten(1).norm(dim=1)[:, None, None, None]
     filters = torch.zeros(DIRECTIONS, 4, resolution, resolution, dtype=torch.float64)
     filters[..., :side, :side] = directions
-    return torch.fft.rfft2(filters.to(device)).conj()
+    spectra: Tensor = torch.fft.rfft2(filters.to(device))
+    return spectra.conj()
 
 
 def _images(pictures: Tensor) -> Tensor:

@@ -77,8 +77,7 @@ def show_worlds(
         s: Particle states (dimensionless), shape [B, N, C] or [K, B, N, C]; for a rule with a
             read-out give `rule.read_out(s)`.
         fps: Frames per second of a film.
-        pixel_size: Usual distance of neighbours [length units]; None: estimated from the first
-            world of the last step.
+        pixel_size: Usual distance of neighbours [length units]; None: estimated at the last step.
         drawing: Further arguments of `draw_worlds`.
     """
     tensors = isinstance(x, Tensor) and isinstance(s, Tensor)
@@ -171,7 +170,7 @@ class Window:
             )
 
     def show(self, frame: Frame) -> None:
-        """Show a frame, uint8, [H, W, 3], and wait as `fps` requires; nothing if it is closed."""
+        """Show a frame, uint8, [H, W, 3], and wait as `fps` requires; do nothing if closed."""
         (pixels,) = checked_frames([frame])
         if self._surface is None:
             return

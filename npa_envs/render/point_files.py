@@ -29,8 +29,7 @@ def write_points(path: str | Path, x: Tensor, gaussians: Gaussians) -> None:
 def write_gaussians(path: str | Path, x: Tensor, gaussians: Gaussians) -> None:
     """Write one world, x [1, N, 3], as a PLY file of 3D Gaussian splatting (Kerbl et al. 2023).
 
-    The file has logarithms of scales, logits of opacities, and colours as spherical harmonics:
-    `f_dc` of degree 0, `f_rest` of degree 1, channel by channel.
+    Scales are logarithms, opacities logits, colours spherical harmonics of degree 0 and 1.
     """
     positions = _checked(x)
     harmonics = _numpy(gaussians.colours)

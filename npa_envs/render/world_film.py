@@ -44,7 +44,7 @@ class WorldFilm:
     """Index of a frame -> steps since the initial world. Frames of damage are not in it."""
 
     def add(self, task: Task, worlds: Particles, step: int, damage: str = "") -> None:
-        """Append a picture of the first world, with a caption: its step, and damage just now."""
+        """Append a picture of the first world; its caption has the step, and damage just now."""
         if not damage:
             self.steps[len(self.frames)] = step
         self.frames.append(to_uint8(task.picture(worlds.x, worlds.s)[0], self.background))

@@ -156,7 +156,7 @@ def check(
 
 
 def chosen_checks(checks: Sequence[Check], names: Sequence[str]) -> list[Check]:
-    """Return the checks of these groups or names, or beginnings of names; without names all."""
+    """Return the checks whose group, name or beginning of a name is in `names`; default: all."""
 
     def selects(name: str, check: Check) -> bool:
         return f"{check.name}/".startswith(f"{name.rstrip('/')}/")

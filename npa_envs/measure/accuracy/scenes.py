@@ -195,7 +195,7 @@ PRECISIONS = {"float32": torch.float32, "float64": torch.float64}
 
 
 class PerceptionOutcome(NamedTuple):
-    """A perception z, [B, N, P], and gradients of a linear functional of it, shaped as s and x."""
+    """A perception z, [B, N, P], and gradients of a functional of it by states and positions."""
 
     z: Tensor
     states: Tensor
@@ -215,7 +215,7 @@ def relative_error(value: Tensor, expected: Tensor) -> float:
 def perception_errors(
     outcome: PerceptionOutcome, expected: PerceptionOutcome, precision: str = "float32"
 ) -> dict[str, float]:
-    """Return relative errors of a perception and gradients, by keys of `LIMITS` with this dtype."""
+    """Return relative errors of a perception and its gradients, by keys of `LIMITS`."""
     pairs = zip(PerceptionOutcome._fields, outcome, expected, strict=True)
     return {f"{what}_{precision}": relative_error(a, b) for what, a, b in pairs}
 

@@ -110,13 +110,12 @@ BOUNDS = {
 - `overflow`: mean |s - clip(s, -1, 1)|, how far states lie outside of [-1, 1].
 - `largest_state`: the largest |s|.
 - `energy`: mean over particles of a step's |Δx|²/ε² + mean Δs² / that of the settled world.
-- `drift`: distance between the centroids of the world and of the settled one / extent of the
-  settled one; only for moving particles in open space.
+- `drift`: distance of the centroid from the settled one's / settled extent; in open space only.
 """
 
 
 def mark_steps(steps: int) -> list[int]:
-    """Return steps of measurements, the settled world's to `steps`, evenly spaced in logarithm."""
+    """Return the steps of measurements, the settled world's to `steps`, logarithmically spaced."""
     settled = min(SETTLED, steps // 2)
     return [round(settled * (steps / settled) ** (k / MARKS)) for k in range(MARKS + 1)]
 
@@ -124,7 +123,7 @@ def mark_steps(steps: int) -> list[int]:
 def measured(runner: RuleRunner, worlds: Particles) -> dict[str, float]:
     """Return the metrics of `BOUNDS` except drift, before they are `relative`.
 
-    Energies are those of the next `ENERGY_STEPS` steps. NaN in x or s: `not_finite` only.
+    Energies are those of the next `ENERGY_STEPS` steps. Worlds with NaN have only `not_finite`.
     """
     with torch.no_grad():
         x, s, *_ = worlds
@@ -222,7 +221,7 @@ def powers_of_two(most: int) -> list[int]:
 def outcome(
     start: RuleWorlds, session: CheckSession, steps: int, dtype: torch.dtype
 ) -> RolloutOutcome:
-    """Roll out in `dtype`, with masks that all dtypes share; return the worlds and gradients."""
+    """Roll out in `dtype`, by update masks that all dtypes share; return worlds and gradients."""
     rule = NPARule(**start.rule.hyper_parameters()).to(start.worlds.x.device)
     rule.load_state_dict(start.rule.state_dict())
     rule.to(dtype)

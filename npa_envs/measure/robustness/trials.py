@@ -242,7 +242,7 @@ class RuleTrial:
         return s
 
     def initial_worlds(self, fraction: float = 1.0, shape: str = "trained") -> Particles:
-        """Return start worlds: a fraction of the particles, in the trained shape or of `SHAPES`."""
+        """Return start worlds with a fraction of the trained particles, in a shape of this name."""
         count = self.particles(fraction)
         random = self.random(StreamId.GROWTH)
         x, s, *_, goal = self.tasks_of(count)[0].seed(
@@ -326,7 +326,7 @@ def wipe(x: Tensor, s: Tensor, random: WorldRandom, box: Box) -> tuple[Tensor, T
 
 
 def slit(x: Tensor, s: Tensor, random: WorldRandom, box: Box) -> tuple[Tensor, Tensor]:
-    """Return x and s cut at a random angle through the centroid, in a box through any particle."""
+    """Return x and s cut at a random angle, through the centroid or in a box a random particle."""
     centre = world_mean(x) if box is None else random_particle(x, random)
     normal = random.normal(x.shape[2], dtype=x.dtype)
     change = partial(cut, normal=normal, gap=DAMAGE_SIZES["cut"])
