@@ -40,7 +40,7 @@ from npa_envs.tasks.targets.views import Views, composited, some_views, views_of
 from npa_envs.tasks.train_config import TrainConfig
 from npa_envs.training import Trainer, override, preset
 from npa_envs.training.task_table import config_to_dict
-from npa_envs.world.graphed_rollouts import release_captures
+from npa_envs.world.capture_cache import release_captures
 from npa_envs.world.particles import Particles
 
 SEEDS = tuple(range(1_000_000, 1_000_008))

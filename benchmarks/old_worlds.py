@@ -22,7 +22,7 @@ from npa_envs.rule.files import load_rule
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2D
 from npa_envs.training import preset
-from npa_envs.world.graphed_rollouts import release_captures
+from npa_envs.world.capture_cache import release_captures
 from npa_envs.world.particles import Particles, combined
 from npa_envs.world.rollout import rollout
 

@@ -55,7 +55,7 @@ from npa_envs.render.colours import to_uint8
 from npa_envs.rule.files import save_rule
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2DTrainConfig
 from npa_envs.training import Trainer, task_entry
-from npa_envs.world.graphed_rollouts import release_captures
+from npa_envs.world.capture_cache import release_captures
 
 STEPS = (64, 128, 256, 512, 1024, 2048, 4096)
 """Steps at which worlds are measured, before `LAST`."""

@@ -35,7 +35,7 @@ from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.texture import Texture
 from npa_envs.training import Trainer, preset
 from npa_envs.training.task_of_rule import task_of_rule
-from npa_envs.world.graphed_rollouts import release_captures
+from npa_envs.world.capture_cache import release_captures
 
 SEEDS = tuple(range(1_000_000, 1_000_008))
 """Seeds of the worlds for the judge."""

@@ -14,8 +14,8 @@ from pathlib import Path
 
 import warp as wp
 
+from npa_envs.compile_lock import cached_under_lock
 from npa_envs.errors import NPAError, shown
-from npa_envs.thread_lock import cached_under_lock
 
 try:
     import fcntl

@@ -51,9 +51,9 @@ METHODS: dict[str, str] = {
     "ppo_world": "npa_envs.agents.learning.sb3:train",
     "evolution": "npa_envs.agents.learning.evolution:train",
     "clone": "npa_envs.agents.learning.clone:train",
-    "random": "npa_envs.agents.learning.baselines:train_random",
-    "zero": "npa_envs.agents.learning.baselines:train_zero",
-    "scripted": "npa_envs.agents.learning.baselines:train_scripted",
+    "random": "npa_envs.agents.learning.untrained_methods:train_random",
+    "zero": "npa_envs.agents.learning.untrained_methods:train_zero",
+    "scripted": "npa_envs.agents.learning.untrained_methods:train_scripted",
 }
 """Methods: functions `f(progress, ...)` of a `Progress` that return a `RuleSet` or a policy. The
 options of a method are its keyword-only arguments, or the fields of a dataclass, the default of its
@@ -63,12 +63,12 @@ KEPT_METHODS = ("ppo", "shac")
 """Methods whose runs can be written to a folder, resumed, and shared by several processes."""
 
 GARDEN_METHODS: dict[str, str] = {
-    "gradient": "npa_envs.agents.learning.baselines:tend_gradient",
+    "gradient": "npa_envs.agents.learning.untrained_methods:tend_gradient",
     "ppo_world": "npa_envs.agents.learning.sb3:train_garden_ppo",
     "sac": "npa_envs.agents.learning.sb3:train_garden_sac",
-    "random": "npa_envs.agents.learning.baselines:train_random",
-    "zero": "npa_envs.agents.learning.baselines:train_zero",
-    "scripted": "npa_envs.agents.learning.baselines:tend_scripted",
+    "random": "npa_envs.agents.learning.untrained_methods:train_random",
+    "zero": "npa_envs.agents.learning.untrained_methods:train_zero",
+    "scripted": "npa_envs.agents.learning.untrained_methods:tend_scripted",
 }
 """Methods for gardens, where a rule updates the particles and actions are of brushes."""
 

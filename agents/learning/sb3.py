@@ -24,10 +24,10 @@ from npa_envs.agents.learning.actor_critic import (
     GaussianRules,
     Schedule,
 )
-from npa_envs.agents.learning.baselines import check_no_start
 from npa_envs.agents.learning.problem import world_seeds
 from npa_envs.agents.learning.progress import Progress
 from npa_envs.agents.learning.rule_set import RuleSet
+from npa_envs.agents.learning.untrained_methods import check_no_start
 from npa_envs.checks import check_fraction, check_positive
 from npa_envs.errors import NPAError, importing, shown
 from npa_envs.wrappers.sb3 import WorldVecEnv, on_host

@@ -49,7 +49,7 @@ def main(arguments: Sequence[str]) -> int:
     """Search; write the elites' rules, and a page and a picture that show them."""
     options = common.parse_options(SearchOptions, "search", arguments)
     common.check_numbers(options, threads=1)
-    from npa_envs.agents.search.output import PAGE, atlas_html, atlas_png, write_elites
+    from npa_envs.agents.search.elite_files import PAGE, atlas_html, atlas_png, write_elites
     from npa_envs.agents.search.quality_diversity import RESULTS, Search
     from npa_envs.atomic_files import write_text
     from npa_envs.measure.benchmark_records import time_limit

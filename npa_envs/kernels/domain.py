@@ -14,8 +14,8 @@ from typing import Any
 
 import warp as wp
 
+from npa_envs.compile_lock import cached_under_lock
 from npa_envs.kernels import native_functions as native
-from npa_envs.thread_lock import cached_under_lock
 
 TERMS_PER_SUM = 4096
 """Terms that are summed before they are added to a total: of a million summed one after the other,

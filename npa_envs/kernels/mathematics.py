@@ -8,8 +8,8 @@ from typing import Any
 
 import warp as wp
 
+from npa_envs.compile_lock import cached_under_lock
 from npa_envs.kernels import native_functions as native
-from npa_envs.thread_lock import cached_under_lock
 
 MOMENT_THRESHOLD = 1e-3
 """Smallest |det M| that is inverted, dimensionless; below it the gradient is not corrected."""

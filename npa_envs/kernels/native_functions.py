@@ -14,7 +14,7 @@ from typing import Any
 
 import warp as wp
 
-from npa_envs.thread_lock import cached_under_lock
+from npa_envs.compile_lock import cached_under_lock
 
 BOTH_DEVICES = ("primitives.cuh", "mathematics.cuh")
 """Files for CPU and CUDA."""

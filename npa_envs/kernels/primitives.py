@@ -13,8 +13,8 @@ from typing import Any
 
 import warp as wp
 
+from npa_envs.compile_lock import cached_under_lock
 from npa_envs.kernels import native_functions as native
-from npa_envs.thread_lock import cached_under_lock
 
 CUDA_LANES = 4
 """Threads that share a particle on CUDA, a power of two; also the smallest channel group."""

@@ -11,7 +11,6 @@ import torch
 from npa_envs.checks import DTYPES, as_list, check_device
 from npa_envs.errors import NPAError, shown
 from npa_envs.ops.backend import SHARED_WORLD
-from npa_envs.ops.draws import draw
 from npa_envs.ops.equivariance import MIXED_VECTORS, VectorSizes, read_rows, steer_rows
 from npa_envs.ops.network import arrange_weights, run_network
 from npa_envs.ops.perceive import NeighbourState, perceive, perceive_rows
@@ -20,6 +19,7 @@ from npa_envs.ops.pictures.cameras import orbit
 from npa_envs.ops.pictures.gaussians import render_gaussians
 from npa_envs.ops.pictures.splat import picture_losses, splat
 from npa_envs.ops.pictures.triangles import nearest_triangles
+from npa_envs.ops.random_numbers import draw
 from npa_envs.ops.rewards_and_ends import EpisodeRules, EpisodeUpdate
 from npa_envs.ops.static_worlds import prepare_static, static_rows
 from npa_envs.ops.update import ActedWorlds, PreparedActions, update_particles

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from npa_envs.checks import DTYPES, check_dense, check_device, checked_count, checked_number
 from npa_envs.errors import NPAError, shown
-from npa_envs.ops.draws import WORD_COUNT, draw
+from npa_envs.ops.random_numbers import WORD_COUNT, draw
 from npa_envs.ops.sort import MAX_INDEX
 
 

@@ -19,7 +19,7 @@ from torch.utils._python_dispatch import is_in_torch_dispatch_mode
 from npa_envs.ops.launch import RecordedLaunches
 from npa_envs.ops.sort import sorts_at_once
 from npa_envs.rule.folded_network import Network
-from npa_envs.world.graphed_rollouts import LAUNCHED_FIRST, CallGroups
+from npa_envs.world.capture_cache import LAUNCHED_FIRST, CallGroups
 from npa_envs.world.particles import Particles, combined
 from npa_envs.world.randomness import Randomness
 from npa_envs.world.rule_settings import rule_form

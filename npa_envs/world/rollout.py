@@ -12,8 +12,8 @@ from npa_envs.errors import NPAError, shown
 from npa_envs.ops.custom_op import check_derivatives
 from npa_envs.ops.physics import Boundary, Physics, make_physics
 from npa_envs.rule.rule import NPARule, check_rule
+from npa_envs.world.capture_cache import CUDA_GRAPH_CHOICES, CudaGraph
 from npa_envs.world.divergence import OnDivergence, make_watch
-from npa_envs.world.graphed_rollouts import CUDA_GRAPH_CHOICES, CudaGraph
 from npa_envs.world.particles import Particles
 from npa_envs.world.randomness import Randomness, check_generator
 from npa_envs.world.rollout_execution import Memory, RolloutSpec, execute, resting

@@ -5,7 +5,7 @@
 | way                      | condition                                      | code                 |
 |--------------------------|------------------------------------------------|----------------------|
 | skip steps once at rest  | rule with dead zone, no gradients, many steps  | `_run_until_rest`    |
-| replay CUDA graphs       | CUDA, third call on                            | graphed_rollouts.py  |
+| replay CUDA graphs       | CUDA, third call on                            | capture_cache.py     |
 | replay recorded launches | CPU, no gradients, small worlds, third call on | recorded_rollout.py  |
 | launch each step         | none                                           | `RolloutSpec.launch` |
 
@@ -26,9 +26,9 @@ from npa_envs.checks import check_finite_positions
 from npa_envs.errors import NPAError
 from npa_envs.ops.physics import Physics
 from npa_envs.rule.rule import NPARule
+from npa_envs.world.capture_cache import CudaGraph, run_captured
 from npa_envs.world.cuda_graph import draws_alone
 from npa_envs.world.divergence import DivergenceWatch
-from npa_envs.world.graphed_rollouts import CudaGraph, run_captured
 from npa_envs.world.particles import Particles, combined
 from npa_envs.world.randomness import Randomness
 from npa_envs.world.recorded_rollout import run_recorded

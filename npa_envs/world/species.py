@@ -12,8 +12,8 @@ from npa_envs.errors import NPAError, shown
 from npa_envs.ops.physics import Boundary
 from npa_envs.ops.species_density import checked_counts
 from npa_envs.rule.rule import NPARule
+from npa_envs.world.capture_cache import CudaGraph
 from npa_envs.world.divergence import OnDivergence
-from npa_envs.world.graphed_rollouts import CudaGraph
 from npa_envs.world.particles import Particles
 from npa_envs.world.randomness import Randomness
 from npa_envs.world.rollout import checked_physics, returned_fields, run_rules, take_physics

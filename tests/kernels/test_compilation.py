@@ -22,7 +22,7 @@ from npa_envs.kernels.cuda.sort import (
     sort_small_worlds,
 )
 from npa_envs.kernels.pictures.blending import block_kernels
-from npa_envs.kernels.pictures.errors import gather_errors
+from npa_envs.kernels.pictures.pixel_errors import gather_errors
 from npa_envs.kernels.portable.rewards_and_ends import update_episodes
 from npa_envs.ops import warmup
 from npa_envs.ops.launch import loaded_modules

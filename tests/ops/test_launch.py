@@ -2,7 +2,7 @@
 
 import torch
 
-from npa_envs.ops.draws import draw
+from npa_envs.ops.random_numbers import draw
 
 WORLDS = 12
 SELECTIONS = (

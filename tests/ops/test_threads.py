@@ -10,9 +10,9 @@ import time
 import pytest
 import torch
 
+from npa_envs.compile_lock import kernel_lock
 from npa_envs.ops import cpu_threads
 from npa_envs.ops.cpu_threads import run_together
-from npa_envs.thread_lock import kernel_lock
 
 needs_fork = pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
 

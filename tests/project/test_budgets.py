@@ -104,7 +104,7 @@ def classes_named_twice() -> int:
 
 def places_that_draw_masks() -> int:
     """Count functions that draw update masks: ones with a probability."""
-    home = {"randomness.py", "draws.py"}
+    home = {"randomness.py", "random_numbers.py"}
     return sum(
         any(
             isinstance(n, ast.Attribute) and n.attr in ("bernoulli", "bernoulli_")

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from npa_envs.world import graphed_rollouts
+from npa_envs.world import capture_cache
 
 
 @pytest.fixture
@@ -11,6 +11,6 @@ def nothing_captured():
     """No captures before and after a test, where there is a CUDA device."""
     for before in (True, False):
         if torch.cuda.is_available():
-            graphed_rollouts.release_captures()
+            capture_cache.release_captures()
         if before:
             yield

@@ -9,7 +9,7 @@ from support.worlds import random_world
 from torch.utils.checkpoint import checkpoint
 
 import npa_envs
-from npa_envs.world import graphed_rollouts
+from npa_envs.world import capture_cache
 
 pytestmark = [pytest.mark.gpu, pytest.mark.usefixtures("nothing_captured")]
 
@@ -70,7 +70,7 @@ def together(*works):
 
 
 def is_captured():
-    return graphed_rollouts.captured_memory(DEVICE) > 0
+    return capture_cache.captured_memory(DEVICE) > 0
 
 
 @pytest.mark.parametrize("gradients", [False, True])
@@ -315,7 +315,7 @@ def test_inside_a_graph_of_the_caller():
 
 
 def test_memory_is_bounded(monkeypatch):
-    monkeypatch.setattr(graphed_rollouts, "MEMORY_FRACTION", 1e-12)
+    monkeypatch.setattr(capture_cache, "MEMORY_FRACTION", 1e-12)
     as_launched(make_rule(), 5)
 
 
@@ -334,6 +334,6 @@ def test_nothing_leaks_over_ten_thousand_calls_of_changing_shapes():
         del states
         if call in (4_999, 9_999):
             torch.cuda.synchronize()
-            taken.append((torch.cuda.memory_allocated(), graphed_rollouts.captured_memory(DEVICE)))
+            taken.append((torch.cuda.memory_allocated(), capture_cache.captured_memory(DEVICE)))
     assert taken[1][0] <= taken[0][0] + 2**20
     assert taken[1][1] == taken[0][1]

@@ -12,6 +12,7 @@ from typing import Any
 
 import warp as wp
 
+from npa_envs.compile_lock import cached_under_lock
 from npa_envs.kernels import native_functions as native
 from npa_envs.kernels.domain import SLACK, TERMS_PER_SUM, group_types, kernel_module
 from npa_envs.kernels.primitives import (
@@ -33,7 +34,6 @@ from npa_envs.kernels.primitives import (
     wait_for_previous_kernel,
     wide_store,
 )
-from npa_envs.thread_lock import cached_under_lock
 
 TILE_PARTICLES = 8
 """Particles that a warp serves together, and rows of one matrix product."""

@@ -16,6 +16,7 @@ fill a GPU need only a thread for each particle. Worlds have at most 2^15 partic
 
 import warp as wp
 
+from npa_envs.compile_lock import cached_under_lock
 from npa_envs.kernels import native_functions as native
 from npa_envs.kernels.domain import SLACK, TERMS_PER_SUM, domain_types, kernel_module
 from npa_envs.kernels.mathematics import falloff_within, smoothing_of
@@ -29,7 +30,6 @@ from npa_envs.kernels.primitives import (
     wait_for_previous_kernel,
     wide_store,
 )
-from npa_envs.thread_lock import cached_under_lock
 
 AHEAD, SHARED_AHEAD = 6, 5
 """Candidates that a thread loads at a time: if a particle has one thread, and if it has several."""

@@ -10,9 +10,9 @@ from types import SimpleNamespace
 
 import warp as wp
 
+from npa_envs.compile_lock import cached_under_lock
 from npa_envs.kernels import native_functions as native
 from npa_envs.kernels.primitives import WARP, wait_for_previous_kernel
-from npa_envs.thread_lock import cached_under_lock
 
 READ_WARPS, PULL_WARPS, STEER_WARPS, MIXING_SUM_WARPS = 4, 4, 4, 16
 """Warps of a block of `read_rows`, `pull_back_rows`, the steering kernels and `add_blocks`."""

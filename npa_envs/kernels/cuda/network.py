@@ -9,9 +9,9 @@ from types import SimpleNamespace
 
 import warp as wp
 
+from npa_envs.compile_lock import cached_under_lock
 from npa_envs.kernels import native_functions as native
 from npa_envs.kernels.primitives import WARP, allow_next_launch, wait_for_previous_kernel
-from npa_envs.thread_lock import cached_under_lock
 
 UNIT_GROUP = 16
 """Hidden units of one step: the inner dimension of a matrix product."""

@@ -24,6 +24,7 @@ from typing import NamedTuple
 
 import warp as wp
 
+from npa_envs.compile_lock import cached_under_lock
 from npa_envs.kernels import native_functions as native
 from npa_envs.kernels.cuda.density import RECORD
 from npa_envs.kernels.domain import group_types, kernel_module
@@ -50,7 +51,6 @@ from npa_envs.kernels.primitives import (
     thread_number,
     wait_for_previous_kernel,
 )
-from npa_envs.thread_lock import cached_under_lock
 
 PERCEIVE_REGISTERS, TEAM_REGISTERS = {2: 80, 3: 112}, 128
 """Registers per thread: for one team per particle, by space dimension, and for several teams."""

@@ -10,6 +10,7 @@ from typing import Any
 
 import warp as wp
 
+from npa_envs.compile_lock import cached_under_lock
 from npa_envs.kernels import native_functions as native
 from npa_envs.kernels.domain import domain_types, kernel_module
 from npa_envs.kernels.pictures.splat import splat_functions, splat_types
@@ -27,7 +28,6 @@ from npa_envs.kernels.primitives import (
     wait_for_previous_kernel,
     wide_store,
 )
-from npa_envs.thread_lock import cached_under_lock
 
 load_pair = make_wide_load(wp.vec2i)
 

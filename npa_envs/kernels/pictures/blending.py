@@ -20,6 +20,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
+from npa_envs.compile_lock import cached_under_lock
 from npa_envs.kernels import native_functions as native
 from npa_envs.kernels.domain import scalar_name
 from npa_envs.kernels.native_functions import TILES, in_ranges, namespace
@@ -39,7 +40,6 @@ from npa_envs.kernels.primitives import (
     make_wide_load,
     sync_block,
 )
-from npa_envs.thread_lock import cached_under_lock
 
 MAX_ALPHA = 0.99
 """Largest alpha: the adjoint divides by 1 - alpha."""

@@ -16,11 +16,11 @@ from typing import Any
 
 import warp as wp
 
+from npa_envs.compile_lock import cached_under_lock
 from npa_envs.kernels import native_functions as native
 from npa_envs.kernels.domain import scalar_name
 from npa_envs.kernels.native_functions import PAIRS, in_ranges, namespace
 from npa_envs.kernels.primitives import make_wide_load, wide_store
-from npa_envs.thread_lock import cached_under_lock
 
 TILE_SIDE = 16
 """Pixels along each side of a tile."""

@@ -18,6 +18,7 @@ from typing import Any
 
 import warp as wp
 
+from npa_envs.compile_lock import cached_under_lock
 from npa_envs.kernels import native_functions as native
 from npa_envs.kernels.domain import scalar_name
 from npa_envs.kernels.native_functions import PAIRS, WORLDS, in_ranges, namespace
@@ -28,7 +29,6 @@ from npa_envs.kernels.primitives import (
     wait_for_previous_kernel,
     wide_store,
 )
-from npa_envs.thread_lock import cached_under_lock
 
 CHANNELS = 4
 """Channels of a picture: red, green, blue and density."""

@@ -1,4 +1,4 @@
-// For pictures/errors.py: order of a picture's tiles by descending numbers of candidates.
+// For pictures/pixel_errors.py: order of a picture's tiles by descending numbers of candidates.
 
 namespace npa {
 

@@ -9,11 +9,11 @@ from types import SimpleNamespace
 
 import warp as wp
 
+from npa_envs.compile_lock import cached_under_lock
 from npa_envs.kernels.domain import TERMS_PER_SUM, domain_types, kernel_module
 from npa_envs.kernels.mathematics import log_scaled, smoothing, spiky_factor, spiky_factor_f64
 from npa_envs.kernels.native_functions import PAIRS, in_ranges, namespace
 from npa_envs.kernels.portable.search import make_search
-from npa_envs.thread_lock import cached_under_lock
 
 
 @cached_under_lock()

@@ -8,9 +8,9 @@ from types import SimpleNamespace
 
 import warp as wp
 
+from npa_envs.compile_lock import cached_under_lock
 from npa_envs.kernels.domain import domain_types, kernel_module
 from npa_envs.kernels.native_functions import ELEMENTS, in_ranges, namespace
-from npa_envs.thread_lock import cached_under_lock
 
 
 @cached_under_lock()

@@ -9,9 +9,9 @@ from types import SimpleNamespace
 
 import warp as wp
 
+from npa_envs.compile_lock import cached_under_lock
 from npa_envs.kernels.domain import domain_types
 from npa_envs.kernels.native_functions import namespace
-from npa_envs.thread_lock import cached_under_lock
 
 FILTER_BLOCK = 32
 """Candidates of a block on a CPU."""

@@ -11,6 +11,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
+from npa_envs.compile_lock import cached_under_lock
 from npa_envs.kernels.domain import domain_types, kernel_module
 from npa_envs.kernels.native_functions import PARTICLES, WORLDS, in_ranges, namespace
 from npa_envs.kernels.primitives import (
@@ -19,7 +20,6 @@ from npa_envs.kernels.primitives import (
     wait_for_previous_kernel,
     wide_store,
 )
-from npa_envs.thread_lock import cached_under_lock
 
 
 @cached_under_lock()

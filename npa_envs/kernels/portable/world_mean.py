@@ -7,10 +7,10 @@ from types import SimpleNamespace
 
 import warp as wp
 
+from npa_envs.compile_lock import cached_under_lock
 from npa_envs.kernels import native_functions as native
 from npa_envs.kernels.domain import scalar_name
 from npa_envs.kernels.primitives import make_lane_sum, wait_for_previous_kernel
-from npa_envs.thread_lock import cached_under_lock
 
 CHUNK = 256
 """Values of one partial sum."""

@@ -30,7 +30,7 @@ from npa_envs.measure.speed.timing import (
     timed,
 )
 from npa_envs.rule.rule import NPARule
-from npa_envs.world.graphed_rollouts import release_captures
+from npa_envs.world.capture_cache import release_captures
 from npa_envs.world.rollout import Memory, rollout
 from npa_envs.world.species import rollout_species
 

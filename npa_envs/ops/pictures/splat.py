@@ -18,7 +18,12 @@ from npa_envs.checks import (
 )
 from npa_envs.errors import NPAError, shown
 from npa_envs.kernels.cuda.sort import BLOCKS, sort_small_splats
-from npa_envs.kernels.pictures.errors import BLOCK_TILES, ROUND_TILES, gather_errors, sum_errors
+from npa_envs.kernels.pictures.pixel_errors import (
+    BLOCK_TILES,
+    ROUND_TILES,
+    gather_errors,
+    sum_errors,
+)
 from npa_envs.kernels.pictures.splat import (
     CHANNELS,
     FOOTPRINT,

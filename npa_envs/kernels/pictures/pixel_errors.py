@@ -8,6 +8,7 @@ do not depend on which threads serve a tile. On a CPU a drawn picture is compare
 
 import warp as wp
 
+from npa_envs.compile_lock import cached_under_lock
 from npa_envs.kernels import native_functions as native
 from npa_envs.kernels.domain import scalar_name
 from npa_envs.kernels.pictures.splat import (
@@ -28,7 +29,6 @@ from npa_envs.kernels.primitives import (
     thread_of_block,
     wait_for_previous_kernel,
 )
-from npa_envs.thread_lock import cached_under_lock
 
 BLOCK_TILES = CUDA_BLOCK
 """Maximum number of tiles of a block: each thread counts the particles around one."""

@@ -10,7 +10,7 @@ import math
 
 import warp as wp
 
-from npa_envs.thread_lock import cached_under_lock
+from npa_envs.compile_lock import cached_under_lock
 
 # Typed constants: a literal in a kernel would be an int32 or a float32.
 MULTIPLIER_0 = wp.constant(wp.uint32(0xD2511F53))

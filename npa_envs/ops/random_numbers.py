@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from npa_envs.kernels.portable.draws import draw_kernel
+from npa_envs.kernels.portable.random_numbers import draw_kernel
 from npa_envs.ops.custom_op import custom_op
 from npa_envs.ops.launch import SCALARS, launch
 
