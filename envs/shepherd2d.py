@@ -18,7 +18,7 @@ from npa_envs.envs.core.task import Start
 from npa_envs.envs.core.vector import vector_class
 from npa_envs.envs.garden.base import GardenEnv, GardenTask, moments_of
 from npa_envs.envs.garden.brushes import OBSERVATION_LIMIT, BrushSpaces, GardenConfig, GardenReward
-from npa_envs.tasks.start_positions import uniform_ball
+from npa_envs.tasks.seeds import uniform_ball
 from npa_envs.world.environment_steps import Physics
 from npa_envs.world.particles import Particles
 from npa_envs.world.randomness import WorldRandom

@@ -16,7 +16,7 @@ from npa_envs import NPARule, WorldRandom, perception_fields
 from npa_envs.agents.learning.evolution import RuleWeights, updates_of
 from npa_envs.checks import check_positive
 from npa_envs.errors import NPAError
-from npa_envs.tasks.start_positions import uniform_ball
+from npa_envs.tasks.seeds import uniform_ball
 from npa_envs.world.particles import Particles, combined
 from npa_envs.world.rollout import rollout_particles
 

@@ -17,7 +17,7 @@ import torch
 import npa_envs
 from npa_envs.render import draw_worlds, write_filmstrip
 from npa_envs.rule.files import rule_metadata
-from npa_envs.tasks.start_positions import uniform_ball
+from npa_envs.tasks.seeds import uniform_ball
 
 IMAGE = Path(__file__).resolve().parents[1] / "images" / "search_elites.webp"
 SEED = 1_000_000

@@ -20,7 +20,7 @@ from npa_envs.envs.core.task import WorldTask
 from npa_envs.errors import NPAError
 from npa_envs.render import STYLES
 from npa_envs.rule.rule import COLOUR_OFFSET
-from npa_envs.tasks.start_positions import uniform_ball
+from npa_envs.tasks.seeds import uniform_ball
 from npa_envs.world.environment_steps import Physics
 from npa_envs.world.particles import Particles
 from npa_envs.world.randomness import WorldRandom

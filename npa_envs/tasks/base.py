@@ -18,7 +18,7 @@ from npa_envs.errors import NPAError, shown
 from npa_envs.ops import world_mean
 from npa_envs.rule.rule import COLOUR_OFFSET, NPARule
 from npa_envs.tasks.damage import DAMAGE_CHANCE, far_points, random_particle, tear_off
-from npa_envs.tasks.start_positions import uniform_ball
+from npa_envs.tasks.seeds import uniform_ball
 from npa_envs.tasks.train_config import Common
 from npa_envs.world.brushes import clump, cut, wipe_state
 from npa_envs.world.particles import Particles

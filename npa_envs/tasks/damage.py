@@ -14,7 +14,7 @@ from torch import Tensor
 from npa_envs.checks import check_positive, check_world, checked_number
 from npa_envs.errors import NPAError, shown, suggest
 from npa_envs.ops import world_mean
-from npa_envs.tasks.start_positions import drawn_indices, uniform_ball
+from npa_envs.tasks.seeds import drawn_indices, uniform_ball
 from npa_envs.world.brushes import Sides, clump, cut, wipe_state
 from npa_envs.world.particles import Particles
 from npa_envs.world.randomness import Randomness, check_generator, normal_draws, uniform_draws

@@ -14,7 +14,7 @@ from npa_envs.errors import NPAError, shown
 from npa_envs.rule.picture_codes import Codes, replace_code
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2D, Morphogenesis2DConfig
-from npa_envs.tasks.start_positions import drawn_indices, drawn_worlds
+from npa_envs.tasks.seeds import drawn_indices, drawn_worlds
 from npa_envs.tasks.targets.images import looks_like_path
 from npa_envs.tasks.targets.picture_points import builtin_targets
 from npa_envs.world.particles import Particles

@@ -16,7 +16,7 @@ from npa_envs.ops import splat
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.base import Frame, ParticleTask, TaskConfig
 from npa_envs.tasks.losses.image_distances import mean_by_world
-from npa_envs.tasks.start_positions import drawn_indices, drawn_worlds
+from npa_envs.tasks.seeds import drawn_indices, drawn_worlds
 from npa_envs.tasks.targets.digit_clouds import PointClouds, Split, augmented, load_clouds
 from npa_envs.tasks.train_config import Common, TrainConfig, fast_run, presets_of, tiny_run
 from npa_envs.world.particles import Particles

@@ -30,7 +30,7 @@ from npa_envs.tasks.losses.texture import (
     is_joint,
     make_texture_loss,
 )
-from npa_envs.tasks.start_positions import uniform_box
+from npa_envs.tasks.seeds import uniform_box
 from npa_envs.tasks.targets.textures import TextureTarget, load_texture
 from npa_envs.tasks.train_config import Common, TrainConfig, presets_of, tiny_run
 from npa_envs.world.brushes import wipe_state

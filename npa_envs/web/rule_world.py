@@ -18,7 +18,7 @@ from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.base import Task
 from npa_envs.tasks.co_morphogenesis2d import CoMorphogenesis2DConfig, together
 from npa_envs.tasks.damage import DAMAGE_SIZES, damage_worlds
-from npa_envs.tasks.start_positions import uniform_ball
+from npa_envs.tasks.seeds import uniform_ball
 from npa_envs.tasks.train_config import TrainConfig
 from npa_envs.training.run_folder import JsonlLog, RunFolder
 from npa_envs.training.task_of_rule import TrainedTask, task_of_rule, trained_config

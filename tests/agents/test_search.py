@@ -21,7 +21,7 @@ from npa_envs.agents.search.quality_diversity import EMITTERS, RESULTS, import_r
 from npa_envs.cli import main
 from npa_envs.errors import MissingDependencyError
 from npa_envs.rule.files import rule_metadata, save_rule
-from npa_envs.tasks.start_positions import uniform_ball
+from npa_envs.tasks.seeds import uniform_ball
 from npa_envs.training.task_of_rule import task_of_rule
 from npa_envs.world.particles import Particles
 from npa_envs.world.randomness import WorldRandom

@@ -24,7 +24,7 @@ from npa_envs.measure.quality import scores
 from npa_envs.ops import orbit, periodic_splat, splat, warmup
 from npa_envs.render import write_gif
 from npa_envs.tasks.damage import damage_worlds, parse_damage
-from npa_envs.tasks.start_positions import uniform_ball, uniform_box
+from npa_envs.tasks.seeds import uniform_ball, uniform_box
 from npa_envs.tasks.texture import TextureConfig
 from npa_envs.training import preset, train
 from npa_envs.web.export import export_web

@@ -28,7 +28,7 @@ from npa_envs.ops import Cameras, orbit, periodic_splat, render_gaussians, splat
 from npa_envs.ops.pictures.cameras import cameras_of_poses, look_at
 from npa_envs.render import draw_worlds, to_uint8, turntable_frames, write_gif, write_png
 from npa_envs.tasks.damage import damage_worlds, parse_damage
-from npa_envs.tasks.start_positions import uniform_ball, uniform_box
+from npa_envs.tasks.seeds import uniform_ball, uniform_box
 from npa_envs.tasks.targets.digit_clouds import read_idx
 from npa_envs.tasks.targets.picture_points import load_target
 from npa_envs.tasks.targets.textures import load_texture

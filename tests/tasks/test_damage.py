@@ -14,7 +14,7 @@ from npa_envs.tasks import damage
 from npa_envs.tasks.base import GrowthConfig, GrowthTask
 from npa_envs.tasks.damage import DAMAGE_CHANCE, FARTHEST, NEAREST, damage_worlds, parse_damage
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2D, Morphogenesis2DConfig
-from npa_envs.tasks.start_positions import uniform_ball
+from npa_envs.tasks.seeds import uniform_ball
 from npa_envs.tasks.texture import Texture, TextureConfig
 from npa_envs.training.task_of_rule import task_of_rule
 from npa_envs.web.rule_world import RuleWorld

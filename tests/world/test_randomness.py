@@ -12,7 +12,7 @@ from npa_envs import WorldRandom
 from npa_envs.errors import NPAError
 from npa_envs.ops.physics import Physics
 from npa_envs.tasks.damage import random_particle
-from npa_envs.tasks.start_positions import uniform_ball
+from npa_envs.tasks.seeds import uniform_ball
 from npa_envs.world.randomness import check_generator, uniform_draws
 from npa_envs.world.steps import draw_step, skip_draws
 

@@ -20,7 +20,7 @@ from npa_envs.ops import splat
 from npa_envs.ops.perceive import Rows
 from npa_envs.ops.physics import make_physics
 from npa_envs.ops.update import update_particles
-from npa_envs.tasks.start_positions import uniform_ball
+from npa_envs.tasks.seeds import uniform_ball
 from npa_envs.world.steps import row_capacity
 
 

@@ -22,7 +22,7 @@ from npa_envs.ops import world_mean
 from npa_envs.rule.files import load_rule
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.damage import DAMAGE_SIZES, random_particle
-from npa_envs.tasks.start_positions import uniform_ball, uniform_box
+from npa_envs.tasks.seeds import uniform_ball, uniform_box
 from npa_envs.training.task_of_rule import task_of_rule, tasks_of_codes
 from npa_envs.world.brushes import clump, cut, nearest_image, offsets_from, wipe_state
 from npa_envs.world.divergence import divergence

@@ -1,4 +1,4 @@
-"""Random start positions, uniform in a ball or a box, and random choices for each world."""
+"""Seeds: random start positions, uniform in a ball or a box; and random choices for each world."""
 
 from __future__ import annotations
 
