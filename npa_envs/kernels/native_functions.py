@@ -16,7 +16,7 @@ import warp as wp
 
 from npa_envs.compile_lock import cached_under_lock
 
-BOTH_DEVICES = ("primitives.cuh", "mathematics.cuh")
+BOTH_DEVICES = ("lanes_and_memory.cuh", "mathematics.cuh")
 """Files for CPU and CUDA."""
 
 CUDA_ONLY = (

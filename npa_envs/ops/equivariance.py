@@ -27,8 +27,8 @@ from npa_envs.kernels.cuda.equivariance import (
     rows_of_warp,
     steering_kernels,
 )
+from npa_envs.kernels.lanes_and_memory import WARP
 from npa_envs.kernels.portable.equivariance import equivariance_kernels
-from npa_envs.kernels.primitives import WARP
 from npa_envs.ops.backend import KernelRequest, choose, multiprocessor_count
 from npa_envs.ops.custom_op import custom_op, once_differentiable
 from npa_envs.ops.launch import SCALARS, launch

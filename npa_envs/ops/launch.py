@@ -26,8 +26,8 @@ from torch import Tensor
 
 from npa_envs.compile_lock import cached_under_lock, kernel_lock
 from npa_envs.errors import NPAError
+from npa_envs.kernels.lanes_and_memory import CUDA_BLOCK
 from npa_envs.kernels.native_functions import MIN_RANGES
-from npa_envs.kernels.primitives import CUDA_BLOCK
 from npa_envs.ops.cpu_threads import even_ranges, run_together
 from npa_envs.ops.cuda_driver import DriverLaunch
 from npa_envs.runtime import in_turn, quiet_warp, start_warp

@@ -16,7 +16,7 @@ from npa_envs.kernels.cuda.network import (
     two_layer_kernel,
     weight_gradient_kernels,
 )
-from npa_envs.kernels.primitives import WARP
+from npa_envs.kernels.lanes_and_memory import WARP
 from npa_envs.ops.backend import KernelRequest, choose, multiprocessor_count
 from npa_envs.ops.custom_op import custom_op, once_differentiable
 from npa_envs.ops.launch import aligned, launch
@@ -34,12 +34,12 @@ class ArrangedWeights(NamedTuple):
 def _arrange_layers(first: Tensor, second: Tensor) -> list[Tensor]:
     """Return weights [H, width], [outputs, H] as scaled tiles, float16, and factors of outputs."""
     hidden, width = first.shape
-    steps, tiles = -(-width // 16), -(-second.shape[0] // 8)
+    column_blocks, tiles = -(-width // 16), -(-second.shape[0] // 8)
     half = functools.partial(torch.empty, dtype=torch.float16, device=first.device)
-    fragments = half(hidden * steps * 32), half(hidden * tiles * 16)
+    fragments = half(hidden * column_blocks * 32), half(hidden * tiles * 16)
     unit_unscale, output_unscale = first.new_empty(hidden), first.new_empty(8 * tiles)
     kernels = arrangement_kernels()
-    device, threads = first.device, (hidden // 8, steps, WARP)
+    device, threads = first.device, (hidden // 8, column_blocks, WARP)
     launch(kernels.arrange_hidden, threads, device, first, unit_unscale, fragments[0])
     threads, scales = (hidden // UNIT_GROUP, tiles, WARP), (unit_unscale, output_unscale)
     launch(kernels.arrange_output, threads, device, second, *scales, fragments[1])
@@ -55,10 +55,10 @@ def _arrange_weights(
         arranged += _arrange_layers(output_weight.T, hidden_weight.T)
         # Left operands of products.
         for weight in (hidden_weight, output_weight.T):
-            steps = -(-weight.shape[1] // 16)
-            size, device = weight.shape[0] * steps * 32, weight.device
+            column_blocks = -(-weight.shape[1] // 16)
+            size, device = weight.shape[0] * column_blocks * 32, weight.device
             arranged.append(torch.empty(size, dtype=torch.bfloat16, device=device))
-            threads = weight.shape[0] // UNIT_GROUP, steps, WARP
+            threads = weight.shape[0] // UNIT_GROUP, column_blocks, WARP
             launch(arrangement_kernels().arrange_left, threads, device, weight, arranged[-1])
     return arranged
 
@@ -114,13 +114,13 @@ def _run_network(
     The latter are bits, one for each hidden unit, written if `mode` is "relu_store_mask". The
     backward pass, "apply_mask", reads them as `stored_bits`.
     """
-    steps, tiles = -(-int(rows.shape[1]) // 16), -(-out_width // 8)
+    column_blocks, tiles = -(-int(rows.shape[1]) // 16), -(-out_width // 8)
     words = 4 * -(-unit_count // MASK_UNITS) if mode == "relu_store_mask" else 0
     bits = rows.new_empty(rows.shape[0], words, dtype=torch.int32)
     output = rows.new_empty(rows.shape[0], out_width)
     warps = -(-rows.shape[0] // ROW_GROUP)
     launch(
-        two_layer_kernel(steps, tiles, mode),
+        two_layer_kernel(column_blocks, tiles, mode),
         -(-warps * WARP // LAYER_BLOCK) * LAYER_BLOCK,
         rows.device,
         unit_count,

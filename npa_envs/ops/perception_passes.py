@@ -12,10 +12,10 @@ from npa_envs.kernels.cuda.adjoint import THREAD_CHANNELS, listed_adjoint
 from npa_envs.kernels.cuda.adjoint import TILE_PARTICLES as ADJOINT_PARTICLES
 from npa_envs.kernels.cuda.density import LIST_BLOCK, TILE_PARTICLES, listed_density, tiled_density
 from npa_envs.kernels.cuda.perceive import PerceptionVariant, listed_perception
+from npa_envs.kernels.lanes_and_memory import WARP
 from npa_envs.kernels.portable.adjoint import adjoint_kernels
 from npa_envs.kernels.portable.density import density_kernels
 from npa_envs.kernels.portable.perceive import perception_kernels
-from npa_envs.kernels.primitives import WARP
 from npa_envs.ops.backend import ListLayout
 from npa_envs.ops.custom_op import custom_op
 from npa_envs.ops.launch import launch
@@ -30,7 +30,7 @@ class NeighbourLists(NamedTuple):
     """Neighbour lists of active particles (rows) for the CUDA kernels; they include themselves."""
 
     layout: ListLayout
-    steps: Tensor
+    index_differences: Tensor
     """Differences of sorted indices from each neighbour to the next, int16; lists of 32 rows are
     interleaved, those of tiles are stored one after the other."""
     lengths: Tensor
@@ -92,11 +92,11 @@ def compute_densities(
     records = positions.new_empty(plan.total, 4)
     particles = positions.new_empty(plan.total if with_particles else 0, plan.space_dim + 1)
     list_shape = -(-plan.row_capacity // INTERLEAVED_LISTS), layout.capacity, INTERLEAVED_LISTS
-    steps = positions.new_empty(list_shape, dtype=torch.int16)
+    differences = positions.new_empty(list_shape, dtype=torch.int16)
     lengths = positions.new_empty(plan.row_capacity, dtype=torch.int32)
     cells = ordered.starts, ordered.cell, positions
     indices = state_index, ordered.original_index, ordered.row_of
-    arrays = (*cells, *indices, particles, records, steps, lengths)
+    arrays = (*cells, *indices, particles, records, differences, lengths)
     if layout.tiled:
         launch(
             tiled_density(plan.periodic, layout.capacity, plan.masked),
@@ -119,7 +119,8 @@ def compute_densities(
             block_dim=LIST_BLOCK,
         )
     no_gradient = positions.new_empty(0, plan.space_dim, dtype=torch.float64)
-    return Densities(particles, no_gradient, NeighbourLists(layout, steps, lengths, records))
+    lists = NeighbourLists(layout, differences, lengths, records)
+    return Densities(particles, no_gradient, lists)
 
 
 def compute_densities_in_cells(plan: KernelPlan, ordered: SortedWorlds) -> Densities:
@@ -173,8 +174,9 @@ def perception_launch(
     else:
         row_index = ordered.row_index[first_row:]
         if lists is not None:
-            steps = lists.steps[first_row // INTERLEAVED_LISTS :]
-            lists = lists._replace(steps=steps, lengths=lists.lengths[first_row:])
+            differences = lists.index_differences[first_row // INTERLEAVED_LISTS :]
+            lengths = lists.lengths[first_row:]
+            lists = lists._replace(index_differences=differences, lengths=lengths)
     group_count, rows, outputs = plan.group_count, (row_index, destination), (out, row_kernel_sum)
     numbers = (
         plan.state_dim,
@@ -217,7 +219,7 @@ def perception_launch(
         ordered.states if states is None else states,
         None if states is None else ordered.original_index,
         *rows,
-        lists.steps,
+        lists.index_differences,
         lists.lengths,
         *outputs,
     )

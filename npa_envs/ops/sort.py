@@ -12,8 +12,8 @@ from torch import Tensor
 from npa_envs.errors import NPAError
 from npa_envs.kernels.cuda.sort import BLOCKS, THREAD_CHANNELS, order_particles, sort_small_worlds
 from npa_envs.kernels.domain import cell_grid, make_domain
+from npa_envs.kernels.lanes_and_memory import CUDA_LANES, WARP
 from npa_envs.kernels.portable.sort import sort_kernels
-from npa_envs.kernels.primitives import CUDA_LANES, WARP
 from npa_envs.ops.backend import (
     KernelRequest,
     ListLayout,

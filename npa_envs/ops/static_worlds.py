@@ -41,8 +41,8 @@ class StaticWorlds(NamedTuple):
     particles: Tensor
     density_gradient: Tensor
     lists: list[Tensor]
-    """For the CUDA backend steps, lengths and records of `NeighbourLists`; on a CPU the tensors of
-    `StaticNeighbours`, or none if they take too much memory; none elsewhere."""
+    """For the CUDA backend index differences, lengths and records of `NeighbourLists`; on a CPU the
+    tensors of `StaticNeighbours`, or none if they take too much memory; none elsewhere."""
 
     def to_list(self) -> list[Tensor]:
         """Return all tensors in one list, for torch operators."""
@@ -68,7 +68,7 @@ def _prepare_static(x: Tensor, state_dim: int, physics: Physics) -> list[Tensor]
     densities = compute_densities(plan, ordered)
     lists: list[Tensor] = []
     if densities.lists is not None:
-        lists = [densities.lists.steps, densities.lists.lengths, densities.lists.records]
+        lists = [*densities.lists[1:4]]
     elif plan.on_cpu:
         lists = _list_neighbours(plan, ordered.starts, densities.particles)
     return StaticWorlds(
@@ -170,8 +170,8 @@ def static_worlds(
     """Return `SortedWorlds` and `Densities` of static worlds for a step with active `rows`."""
     lists = None
     if plan.lists_neighbours:
-        steps, lengths, records = worlds.lists
-        lists = NeighbourLists(plan.list_layout, steps, lengths, records, per_particle=True)
+        differences, lengths, records = worlds.lists
+        lists = NeighbourLists(plan.list_layout, differences, lengths, records, per_particle=True)
     # States in groups of channels.
     padding = 0, plan.group_count * plan.width - plan.state_dim
     ordered = SortedWorlds(

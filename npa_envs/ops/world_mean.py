@@ -1,4 +1,4 @@
-"""Mean over each world as a torch operator: the same in every batch, bit for bit."""
+"""Mean within each world as a torch operator: the same in every batch, bit for bit."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from npa_envs.ops.launch import SCALARS, launch
 
 
 def average_sums(partial_sums: Tensor, value_count: int, like: Tensor) -> Tensor:
-    """Return means [B, F]: float64 sums [B, any, F] in total, by `value_count`, typed as `like`."""
+    """Return `partial_sums`, float64 [B, K, F], summed over K, / `value_count`, typed as `like`."""
     world_count, _, width = partial_sums.shape
     lanes = _lanes(like.device)
     kernels = mean_kernels(SCALARS[like.dtype], lanes)
@@ -66,7 +66,7 @@ class _WorldMean(torch.autograd.Function):
 
 
 def world_mean(values: Tensor) -> Tensor:
-    """Return the mean over each world; differentiable, bit for bit independent of other worlds.
+    """Return the mean within each world; differentiable, bit for bit independent of other worlds.
 
     It is summed in float64 in an order that depends only on M. The order of torch's own means may
     change with the number of worlds, and with it their last bit.
@@ -89,3 +89,8 @@ def world_mean(values: Tensor) -> Tensor:
     check_derivatives(values=values)
     means: Tensor = _WorldMean.apply(values)  # type: ignore[no-untyped-call]
     return means
+
+
+def scalar_world_mean(values: Tensor) -> Tensor:
+    """Return the mean within each world of all its numbers [B, ...], as `world_mean`, [B]."""
+    return world_mean(values.flatten(1)[..., None])[:, 0]

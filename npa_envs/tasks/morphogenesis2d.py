@@ -21,10 +21,10 @@ from npa_envs.checks import (
 from npa_envs.errors import NPAError
 from npa_envs.ops import splat, world_mean
 from npa_envs.ops.pictures.splat import picture_losses
+from npa_envs.ops.world_mean import scalar_world_mean
 from npa_envs.rule.picture_codes import replace_code
 from npa_envs.rule.rule import COLOUR_OFFSET, LIFE, NPARule
 from npa_envs.tasks.base import GrowthConfig, GrowthTask
-from npa_envs.tasks.losses.image_distances import mean_by_world
 from npa_envs.tasks.targets.images import MAX_POINT_COUNT
 from npa_envs.tasks.targets.picture_points import PointTarget, load_target
 from npa_envs.tasks.train_config import Common, TrainConfig, fast_run, presets_of, tiny_run
@@ -295,7 +295,7 @@ class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
         with_gradient = torch.is_grad_enabled() and (x.requires_grad or s.requires_grad)
         if with_gradient or self.config.division or self.goal_count > 0:
             density, colour = self.splat_errors(x, s)
-            return mean_by_world(density), mean_by_world(colour)
+            return scalar_world_mean(density), scalar_world_mean(colour)
         return self._picture_losses(turned(x, self.best_turn(x, s)) if self._tries_angles else x, s)
 
     def metric(self, x: Tensor, s: Tensor) -> Tensor:
@@ -353,7 +353,7 @@ class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
             # The picture is linear in the colours: its gradient sums over a particle's splat.
             (pulled,) = torch.autograd.grad(picture[..., 0], blank, owned)
         pixel_count = self.config.resolution**2
-        unowned = mean_by_world(UNOWNED * owned)
+        unowned = scalar_world_mean(UNOWNED * owned)
         return pulled[..., 0] * (x.shape[1] / pixel_count) + unowned[:, None]
 
     @torch.no_grad()

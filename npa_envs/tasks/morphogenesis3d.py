@@ -21,10 +21,11 @@ from npa_envs.checks import (
 )
 from npa_envs.errors import NPAError
 from npa_envs.ops import Cameras, render_gaussians
+from npa_envs.ops.world_mean import scalar_world_mean
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.base import GrowthConfig, GrowthTask, contributions_to_loss
 from npa_envs.tasks.gaussian_outputs import OUTPUTS, Gaussians, appearance
-from npa_envs.tasks.losses.image_distances import MultiScaleSimilarity, mean_by_world
+from npa_envs.tasks.losses.ms_ssim import MultiScaleSimilarity
 from npa_envs.tasks.targets.views import (
     Views,
     ViewTarget,
@@ -288,7 +289,7 @@ class Morphogenesis3D(GrowthTask[Morphogenesis3DConfig]):
             for views in (self._draw(x, gaussians, target.cameras), target.pictures.to(x))
         )
         size = (drawn - pictures).abs()
-        terms = {"views": mean_by_world(size)}
+        terms = {"views": scalar_world_mean(size)}
         if self._similarity is not None:
             similarity = self._similarity(drawn.movedim(-1, 2), pictures.movedim(-1, 1))
             terms["structure"] = 1.0 - similarity.mean(dim=(1, 2))

@@ -13,9 +13,9 @@ from torch import Tensor
 from npa_envs.checks import check_non_negative, check_positive, check_seed, check_text
 from npa_envs.errors import NPAError
 from npa_envs.ops import splat
+from npa_envs.ops.world_mean import scalar_world_mean
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.base import Frame, ParticleTask, TaskConfig
-from npa_envs.tasks.losses.image_distances import mean_by_world
 from npa_envs.tasks.seeds import drawn_indices, drawn_worlds
 from npa_envs.tasks.targets.digit_clouds import PointClouds, Split, augmented, load_clouds
 from npa_envs.tasks.train_config import Common, TrainConfig, fast_run, presets_of, tiny_run
@@ -215,7 +215,7 @@ class PointClassification(ParticleTask[PointClassificationConfig]):
 
     def metric(self, x: Tensor, s: Tensor) -> Tensor:
         """Return each world's mean of (class scores - one-hot of its class)², shape [B]."""
-        return mean_by_world(self.errors(s))
+        return scalar_world_mean(self.errors(s))
 
     def trial_metric(self, worlds: Particles) -> Tensor:
         """Return the fraction of each world's particles with a wrong class, shape [B]."""

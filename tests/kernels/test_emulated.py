@@ -55,7 +55,7 @@ def test_tiles_find_all_neighbours_of_all_particles(tmp_path):
     tiles = tiles.replace(wait, wait.split("{")[0] + "{}\n")
     mathematics = text_of("mathematics.cuh")
     needed = [function_of(mathematics, name) for name in ("falloff_within", "smoothing")]
-    needed.append(function_of(text_of("primitives.cuh"), "sum_up_to"))
+    needed.append(function_of(text_of("lanes_and_memory.cuh"), "sum_up_to"))
     head = "namespace npa {\n" + "\n".join(needed) + "}\nusing std::fmaf;\n"
     (tmp_path / "native.h").write_text(head + tiles, encoding="utf-8")
     printed = printed_by("tiles_on_cpu.cpp", tmp_path, KERNELS)

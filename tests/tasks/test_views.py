@@ -11,7 +11,7 @@ from PIL import Image
 
 from npa_envs.errors import NPAError
 from npa_envs.ops import orbit
-from npa_envs.tasks.losses.image_distances import MultiScaleSimilarity
+from npa_envs.tasks.losses.ms_ssim import MultiScaleSimilarity
 from npa_envs.tasks.morphogenesis3d import Morphogenesis3D, Morphogenesis3DConfig, blurred
 from npa_envs.tasks.targets import meshes
 from npa_envs.tasks.targets.meshes import AMBIENT, RADIUS, Mesh, draw_mesh, load_mesh

@@ -15,7 +15,7 @@ import warp as wp
 from npa_envs.compile_lock import cached_under_lock
 from npa_envs.kernels import native_functions as native
 from npa_envs.kernels.domain import SLACK, TERMS_PER_SUM, group_types, kernel_module
-from npa_envs.kernels.primitives import (
+from npa_envs.kernels.lanes_and_memory import (
     CUDA_BLOCK,
     WARP,
     allow_next_launch,

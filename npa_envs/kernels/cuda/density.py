@@ -19,8 +19,7 @@ import warp as wp
 from npa_envs.compile_lock import cached_under_lock
 from npa_envs.kernels import native_functions as native
 from npa_envs.kernels.domain import SLACK, TERMS_PER_SUM, domain_types, kernel_module
-from npa_envs.kernels.mathematics import falloff_within, smoothing_of
-from npa_envs.kernels.primitives import (
+from npa_envs.kernels.lanes_and_memory import (
     WARP,
     as_word,
     load_integer,
@@ -30,6 +29,7 @@ from npa_envs.kernels.primitives import (
     wait_for_previous_kernel,
     wide_store,
 )
+from npa_envs.kernels.mathematics import falloff_within, smoothing_of
 
 AHEAD, SHARED_AHEAD = 6, 5
 """Candidates that a thread loads at a time: if a particle has one thread, and if it has several."""

@@ -12,7 +12,7 @@ import warp as wp
 
 from npa_envs.compile_lock import cached_under_lock
 from npa_envs.kernels import native_functions as native
-from npa_envs.kernels.primitives import WARP, wait_for_previous_kernel
+from npa_envs.kernels.lanes_and_memory import WARP, wait_for_previous_kernel
 
 READ_WARPS, PULL_WARPS, STEER_WARPS, MIXING_SUM_WARPS = 4, 4, 4, 16
 """Warps of a block of `read_rows`, `pull_back_rows`, the steering kernels and `add_blocks`."""

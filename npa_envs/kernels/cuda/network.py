@@ -11,7 +11,7 @@ import warp as wp
 
 from npa_envs.compile_lock import cached_under_lock
 from npa_envs.kernels import native_functions as native
-from npa_envs.kernels.primitives import WARP, allow_next_launch, wait_for_previous_kernel
+from npa_envs.kernels.lanes_and_memory import WARP, allow_next_launch, wait_for_previous_kernel
 
 UNIT_GROUP = 16
 """Hidden units of one step: the inner dimension of a matrix product."""
@@ -33,10 +33,10 @@ WIDE, WIDE_REGISTERS = range(81, 97), 128
 
 
 @cached_under_lock()
-def two_layer_kernel(steps: int, tiles: int, mode: str) -> wp.Kernel:
+def two_layer_kernel(column_blocks: int, tiles: int, mode: str) -> wp.Kernel:
     """Return the kernel that applies a network of two layers to rows; a warp serves 16 rows.
 
-    Rows have at most 16 `steps` columns, outputs at most 8 `tiles`. `mode` "relu" applies ReLU to
+    Rows have at most 16 `column_blocks` columns, outputs at most 8 `tiles`. `mode` "relu" applies ReLU to
     hidden units, "relu_store_mask" also stores its mask, "apply_mask" applies a stored mask
     instead.
 
@@ -46,12 +46,12 @@ def two_layer_kernel(steps: int, tiles: int, mode: str) -> wp.Kernel:
     bytes at a time and outputs written 8 at a time: both must be dense, begin at a multiple of that
     and have a multiple of 4, or 2, columns. Weights begin at a multiple of 16 bytes, too.
     """
-    name = f"npa_envs.kernels.network_{mode}_{steps}_{tiles}"
-    registers = WIDE_REGISTERS if max(16 * steps, 8 * tiles) in WIDE else LAYER_REGISTERS
+    name = f"npa_envs.kernels.network_{mode}_{column_blocks}_{tiles}"
+    registers = WIDE_REGISTERS if max(16 * column_blocks, 8 * tiles) in WIDE else LAYER_REGISTERS
 
     two_layers = native.function(
         "two_layers",
-        *(steps, tiles, mode.upper(), ROW_TARGET),
+        *(column_blocks, tiles, mode.upper(), ROW_TARGET),
         untyped="unit_count rows hidden_weights output_weights output_unscale signs output",
     )
 
@@ -75,19 +75,19 @@ def two_layer_kernel(steps: int, tiles: int, mode: str) -> wp.Kernel:
 
 @cached_under_lock()
 def weight_gradient_kernels(
-    steps: int, tiles: int, out_tiles: int, warps: int, unit_blocks: int, words: int
+    column_blocks: int, tiles: int, out_tiles: int, warps: int, unit_blocks: int, words: int
 ) -> SimpleNamespace:
     """Return two kernels: both layers' weight gradients, summed over ranges of rows; their total.
 
-    Rows have 16 `steps` or 8 `tiles` columns, gradients by outputs 8 `out_tiles`, masks `words`
+    Rows have 16 `column_blocks` or 8 `tiles` columns, gradients with respect to outputs 8 `out_tiles`, masks `words`
     words. A block sums a range of rows for 1 / `unit_blocks` of the hidden units, each of its
     `warps` for `WARP_UNITS`. It recomputes hidden units and gradients by them, transposed, as left
     operands of the weight gradients' products. Numbers are pairs of bfloat16, which need no
     scaling: scales differ among rows, and sums run over rows.
     """
-    variant = f"{steps}_{tiles}_{out_tiles}_{warps}_{unit_blocks}_{words}"
+    variant = f"{column_blocks}_{tiles}_{out_tiles}_{warps}_{unit_blocks}_{words}"
     module = native.module(f"npa_envs.kernels.network_gradients_{variant}")
-    sizes = steps, tiles, out_tiles, warps, unit_blocks, words, ROW_TILE
+    sizes = column_blocks, tiles, out_tiles, warps, unit_blocks, words, ROW_TILE
     weight_sums = native.function(
         "weight_sums",
         *sizes,

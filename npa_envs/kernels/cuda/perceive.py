@@ -28,16 +28,7 @@ from npa_envs.compile_lock import cached_under_lock
 from npa_envs.kernels import native_functions as native
 from npa_envs.kernels.cuda.density import RECORD
 from npa_envs.kernels.domain import group_types, kernel_module
-from npa_envs.kernels.mathematics import (
-    inverse_root,
-    make_corrected,
-    perception_module_name,
-    scaling_functions,
-    smoothing,
-    spiky_factor_f64,
-    within,
-)
-from npa_envs.kernels.primitives import (
+from npa_envs.kernels.lanes_and_memory import (
     CUDA_BLOCK,
     CUDA_LANES,
     any_in_warp,
@@ -50,6 +41,15 @@ from npa_envs.kernels.primitives import (
     sync_warp,
     thread_number,
     wait_for_previous_kernel,
+)
+from npa_envs.kernels.mathematics import (
+    inverse_root,
+    make_corrected,
+    perception_module_name,
+    scaling_functions,
+    smoothing,
+    spiky_factor_f64,
+    within,
 )
 
 PERCEIVE_REGISTERS, TEAM_REGISTERS = {2: 80, 3: 112}, 128

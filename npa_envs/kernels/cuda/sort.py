@@ -13,9 +13,7 @@ import warp as wp
 from npa_envs.compile_lock import cached_under_lock
 from npa_envs.kernels import native_functions as native
 from npa_envs.kernels.domain import domain_types, kernel_module
-from npa_envs.kernels.pictures.splat import splat_functions, splat_types
-from npa_envs.kernels.portable.world_mean import CHUNK
-from npa_envs.kernels.primitives import (
+from npa_envs.kernels.lanes_and_memory import (
     CUDA_LANES,
     WARP,
     block_number,
@@ -28,6 +26,8 @@ from npa_envs.kernels.primitives import (
     wait_for_previous_kernel,
     wide_store,
 )
+from npa_envs.kernels.pictures.splat import splat_functions, splat_types
+from npa_envs.kernels.portable.world_mean import CHUNK
 
 load_pair = make_wide_load(wp.vec2i)
 

@@ -23,6 +23,14 @@ import warp as wp
 from npa_envs.compile_lock import cached_under_lock
 from npa_envs.kernels import native_functions as native
 from npa_envs.kernels.domain import scalar_name
+from npa_envs.kernels.lanes_and_memory import (
+    WARP,
+    any_in_warp,
+    load_integer,
+    make_lane_sum,
+    make_wide_load,
+    sync_block,
+)
 from npa_envs.kernels.native_functions import TILES, in_ranges, namespace
 from npa_envs.kernels.pictures.gaussians import (
     CHANNELS,
@@ -31,14 +39,6 @@ from npa_envs.kernels.pictures.gaussians import (
     TILE_SIDE,
     gaussian_functions,
     gaussian_types,
-)
-from npa_envs.kernels.primitives import (
-    WARP,
-    any_in_warp,
-    load_integer,
-    make_lane_sum,
-    make_wide_load,
-    sync_block,
 )
 
 MAX_ALPHA = 0.99

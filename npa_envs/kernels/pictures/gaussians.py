@@ -19,8 +19,8 @@ import warp as wp
 from npa_envs.compile_lock import cached_under_lock
 from npa_envs.kernels import native_functions as native
 from npa_envs.kernels.domain import scalar_name
+from npa_envs.kernels.lanes_and_memory import make_wide_load, wide_store
 from npa_envs.kernels.native_functions import PAIRS, in_ranges, namespace
-from npa_envs.kernels.primitives import make_wide_load, wide_store
 
 TILE_SIDE = 16
 """Pixels along each side of a tile."""

@@ -11,6 +11,15 @@ import warp as wp
 from npa_envs.compile_lock import cached_under_lock
 from npa_envs.kernels import native_functions as native
 from npa_envs.kernels.domain import scalar_name
+from npa_envs.kernels.lanes_and_memory import (
+    CUDA_BLOCK,
+    WARP,
+    block_number,
+    make_lane_sum,
+    make_wide_load,
+    thread_of_block,
+    wait_for_previous_kernel,
+)
 from npa_envs.kernels.pictures.splat import (
     CHANNELS,
     TILE_HEIGHT,
@@ -19,15 +28,6 @@ from npa_envs.kernels.pictures.splat import (
     gather_functions,
     gather_registers,
     splat_types,
-)
-from npa_envs.kernels.primitives import (
-    CUDA_BLOCK,
-    WARP,
-    block_number,
-    make_lane_sum,
-    make_wide_load,
-    thread_of_block,
-    wait_for_previous_kernel,
 )
 
 BLOCK_TILES = CUDA_BLOCK

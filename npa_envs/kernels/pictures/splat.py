@@ -21,14 +21,14 @@ import warp as wp
 from npa_envs.compile_lock import cached_under_lock
 from npa_envs.kernels import native_functions as native
 from npa_envs.kernels.domain import scalar_name
-from npa_envs.kernels.native_functions import PAIRS, WORLDS, in_ranges, namespace
-from npa_envs.kernels.primitives import (
+from npa_envs.kernels.lanes_and_memory import (
     load_integer,
     make_lane_sum,
     make_wide_load,
     wait_for_previous_kernel,
     wide_store,
 )
+from npa_envs.kernels.native_functions import PAIRS, WORLDS, in_ranges, namespace
 
 CHANNELS = 4
 """Channels of a picture: red, green, blue and density."""

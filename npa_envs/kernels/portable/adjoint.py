@@ -18,6 +18,7 @@ import warp as wp
 
 from npa_envs.compile_lock import cached_under_lock
 from npa_envs.kernels.domain import group_types, kernel_module
+from npa_envs.kernels.lanes_and_memory import make_add_scaled, make_wide_load
 from npa_envs.kernels.mathematics import (
     log_scale_adjoint,
     smoothing,
@@ -27,7 +28,6 @@ from npa_envs.kernels.mathematics import (
 )
 from npa_envs.kernels.native_functions import PAIRS, in_ranges
 from npa_envs.kernels.portable.search import make_search
-from npa_envs.kernels.primitives import make_add_scaled, make_wide_load
 
 STATE_REGISTERS = 64
 """Registers per thread of `gather_state_cotangents`, which mostly waits for memory."""

@@ -12,6 +12,7 @@ import warp as wp
 
 from npa_envs.compile_lock import cached_under_lock
 from npa_envs.kernels.domain import group_types, kernel_module
+from npa_envs.kernels.lanes_and_memory import make_add_scaled, make_wide_load
 from npa_envs.kernels.mathematics import (
     log_scaled,
     make_corrected,
@@ -21,7 +22,6 @@ from npa_envs.kernels.mathematics import (
 )
 from npa_envs.kernels.native_functions import PAIRS, in_ranges
 from npa_envs.kernels.portable.search import make_search
-from npa_envs.kernels.primitives import make_add_scaled, make_wide_load
 
 PERCEIVE_REGISTERS = 128
 """Registers per thread of the perception pass: more threads at a time are worth a few spills."""

@@ -3,7 +3,7 @@
 import warp as wp
 
 from npa_envs.kernels import native_functions as native
-from npa_envs.kernels.primitives import wait_for_previous_kernel
+from npa_envs.kernels.lanes_and_memory import wait_for_previous_kernel
 
 SUCCESS, DIVERGED, TIME_LIMIT = 1, 2, 4
 """Bits of an ending, the reasons why an episode is over; 0 while it runs."""

@@ -13,13 +13,13 @@ import warp as wp
 
 from npa_envs.compile_lock import cached_under_lock
 from npa_envs.kernels.domain import domain_types, kernel_module
-from npa_envs.kernels.native_functions import PARTICLES, WORLDS, in_ranges, namespace
-from npa_envs.kernels.primitives import (
+from npa_envs.kernels.lanes_and_memory import (
     load_integer,
     make_read_channels,
     wait_for_previous_kernel,
     wide_store,
 )
+from npa_envs.kernels.native_functions import PARTICLES, WORLDS, in_ranges, namespace
 
 
 @cached_under_lock()

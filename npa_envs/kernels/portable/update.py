@@ -12,8 +12,7 @@ import warp as wp
 from npa_envs.compile_lock import cached_under_lock
 from npa_envs.kernels import native_functions as native
 from npa_envs.kernels.domain import domain_types, kernel_module, scalar_name
-from npa_envs.kernels.native_functions import ELEMENTS, in_ranges, namespace
-from npa_envs.kernels.primitives import (
+from npa_envs.kernels.lanes_and_memory import (
     allow_next_launch,
     load_integer,
     make_read_at,
@@ -21,6 +20,7 @@ from npa_envs.kernels.primitives import (
     wait_for_previous_kernel,
     write_at,
 )
+from npa_envs.kernels.native_functions import ELEMENTS, in_ranges, namespace
 
 THREAD_CHANNELS = 4
 """Adjacent channels of a particle, or columns of a row, that one thread changes."""

@@ -1,4 +1,4 @@
-"""Means over each world, in an order of summation that depends only on the world's size.
+"""Means within each world, in an order of summation that depends only on the world's size.
 
 On CUDA the threads of a warp share a sum, first of a chunk of values, then of the chunks' sums.
 """
@@ -10,7 +10,7 @@ import warp as wp
 from npa_envs.compile_lock import cached_under_lock
 from npa_envs.kernels import native_functions as native
 from npa_envs.kernels.domain import scalar_name
-from npa_envs.kernels.primitives import make_lane_sum, wait_for_previous_kernel
+from npa_envs.kernels.lanes_and_memory import make_lane_sum, wait_for_previous_kernel
 
 CHUNK = 256
 """Values of one partial sum."""
@@ -21,7 +21,7 @@ MEAN_LANES = 32
 
 @cached_under_lock()
 def mean_kernels(scalar: type, lanes: int) -> SimpleNamespace:
-    """Return the kernels that average over worlds; `lanes` threads share a sum."""
+    """Return the kernels of the mean within each world; `lanes` threads share a sum."""
     module = native.module(f"npa_envs.kernels.worlds_{scalar_name(scalar)}_l{lanes}")
     lane_sum = make_lane_sum(wp.float64, lanes, whole_warps=True)
 

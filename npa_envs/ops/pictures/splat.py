@@ -18,6 +18,7 @@ from npa_envs.checks import (
 )
 from npa_envs.errors import NPAError, shown
 from npa_envs.kernels.cuda.sort import BLOCKS, sort_small_splats
+from npa_envs.kernels.lanes_and_memory import CUDA_BLOCK
 from npa_envs.kernels.pictures.pixel_errors import (
     BLOCK_TILES,
     ROUND_TILES,
@@ -35,7 +36,6 @@ from npa_envs.kernels.pictures.splat import (
     make_view,
     splat_kernels,
 )
-from npa_envs.kernels.primitives import CUDA_BLOCK
 from npa_envs.ops.backend import KernelRequest, multiprocessor_count
 from npa_envs.ops.custom_op import check_derivatives, custom_op, once_differentiable
 from npa_envs.ops.launch import SCALARS, aligned, launch

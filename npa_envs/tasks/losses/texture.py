@@ -16,7 +16,7 @@ from torch import Tensor
 
 from npa_envs.atomic_files import check_torch_archive, home_path, open_regular
 from npa_envs.errors import NPAError, shown, suggest
-from npa_envs.tasks.losses.image_distances import mean_by_world
+from npa_envs.ops.world_mean import scalar_world_mean
 
 DEFAULT_LOSS = "patch_swd"
 """Name of the default loss, which needs no download."""
@@ -267,7 +267,7 @@ class SlicedWasserstein(TextureDistance):
         for features, expected, scale in zip(described, self._quantiles, self._scales, strict=True):
             ordered = features.transpose(1, 2).contiguous().sort(dim=-1).values
             squares = (ordered - expected.to(ordered)).square()
-            distance = mean_by_world(squares)
+            distance = scalar_world_mean(squares)
             total = total + scale.to(distance) * distance
         return total
 
@@ -401,7 +401,7 @@ def _matched(rows: Tensor, expected: Tensor) -> Tensor:
     # Σ (p − t)² over the target's patches, gathered by the world's: its gradient has a fixed order.
     ratio = rows.shape[1] / expected.shape[0]
     backward = ratio * (times * rows.square() - 2.0 * rows * sums)
-    return torch.maximum(mean_by_world(forward), mean_by_world(backward) + mean_square)
+    return torch.maximum(scalar_world_mean(forward), scalar_world_mean(backward) + mean_square)
 
 
 # The paper's loss. Of VGG16 (Simonyan and Zisserman 2014) only the weights are needed, not

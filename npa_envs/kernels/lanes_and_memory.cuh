@@ -1,4 +1,4 @@
-// For primitives.py: access to memory, up to 16 bytes at a time, and to other threads' values.
+// For lanes_and_memory.py: access to memory, up to 16 bytes at a time, and to other threads' values.
 //
 // The first half also exists on a CPU, where a particle has one thread and no wide access.
 

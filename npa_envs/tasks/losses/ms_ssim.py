@@ -1,4 +1,4 @@
-"""MS-SSIM, the similarity of pictures of worlds and of a target, and means by world."""
+"""MS-SSIM: the similarity of pictures of worlds to a target at several sizes of the pictures."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import torch
 from torch import Tensor
 
 from npa_envs.errors import NPAError
-from npa_envs.ops import world_mean
 
 SIZE_EXPONENTS = (0.0448, 0.2856, 0.3001, 0.2363, 0.1333)
 """Exponents of the five picture sizes' similarities, from fine to coarse (Wang et al. 2003)."""
@@ -22,11 +21,6 @@ STABILISERS = (0.01**2, 0.03**2)
 
 MIN_SIMILARITY = 1e-4
 """Least value of a size's similarity, to which smaller ones are raised, without gradient."""
-
-
-def mean_by_world(values: Tensor) -> Tensor:
-    """Return the mean of each world's numbers [B, ...], with the same bits in every batch, [B]."""
-    return world_mean(values.flatten(1)[..., None])[:, 0]
 
 
 class MultiScaleSimilarity:
