@@ -97,13 +97,13 @@ class PointClassificationTask(TargetEnvTask[PointClassificationEnvConfig]):
         return task.for_rule(rule.requires_grad_(False))
 
     def losses(self, x: Tensor, s: Tensor) -> Mapping[str, Tensor]:
-        """Return each world's mean score and mean weighted overflow, by name, [B] each."""
+        """Return each world's means of the terms of `particle_losses`, by name, [B] each."""
         overflow = self.config.overflow_weight * world_mean(self.task.overflows(s)[..., None])[:, 0]
         score = world_mean(self._scores(s)[..., None])[:, 0]
         return {self.config.score: score, "overflow": overflow}
 
     def particle_losses(self, x: Tensor, s: Tensor) -> Tensor:
-        """Return each particle's score plus weighted overflow of states, shape [B, N]."""
+        """Return each particle's score plus weighted |s - clip(s, -1, 1)|, shape [B, N]."""
         return self._scores(s) + self.config.overflow_weight * self.task.overflows(s)
 
     def particle_gains(self, before: tuple[Tensor, Tensor], after: tuple[Tensor, Tensor]) -> Tensor:

@@ -124,7 +124,7 @@ def log_scale_tangential(length: Any):
 
 @wp.func
 def log_scale_adjoint(scaled: Any, cotangent: Any):
-    """Loss gradient by v from `cotangent`, the loss gradient by L(v), and from `scaled` = L(v)."""
+    """Loss gradient with respect to v; `cotangent` is that with respect to `scaled` = L(v)."""
     length = wp.length(scaled)
     tangential = log_scale_tangential(length)
     result = tangential * cotangent

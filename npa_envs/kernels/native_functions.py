@@ -71,14 +71,21 @@ def function(
     arguments = dict.fromkeys(untyped.split(), Any) | arguments
     template = f"<{', '.join(map(_in_cpp, parameters))}>" if parameters else ""
     call = f"npa::{name}{template}({', '.join(arguments)});"
+    types = arguments if returns is None else arguments | {"return": returns}
+    return _from_stub(name, types, f"    {'return ' * (returns is not None)}{call}\n")
 
+
+def _from_stub(name: str, types: dict[str, Any], snippet: str) -> Any:
+    """Return a C++ snippet as a Warp function; `types` are those of arguments and "return"."""
+
+    # Warp reads names and types from a Python stub. It allows a stub to return something only if
+    # its source has one decorator, `func_native` of some object: here of `native`.
     def declare(stub: Any) -> Any:
-        stub.__qualname__ = name
-        stub.__annotations__ = arguments if returns is None else arguments | {"return": returns}
-        stub.__signature__ = inspect.Signature([inspect.Parameter(key, 1) for key in arguments])
-        return wp.func_native(f"    {'return ' * (returns is not None)}{call}\n")(stub)
+        names = [inspect.Parameter(key, 1) for key in types if key != "return"]
+        stub.__qualname__, stub.__annotations__ = name, types
+        stub.__signature__ = inspect.Signature(names)
+        return wp.func_native(snippet)(stub)
 
-    # Warp lets a stub return something if its only decorator is some object's `func_native`.
     native = SimpleNamespace(func_native=lambda: declare)
 
     @native.func_native()

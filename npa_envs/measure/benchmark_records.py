@@ -1,7 +1,7 @@
-"""Records of measurements (JSON files), the facts of their runs, and tables as text.
+"""Records of measurements (JSON files), the metadata of their runs, and tables as text.
 
-The facts of a run are what its results depend on: device, machine, commit, versions, settings. A
-record is written after every result, so that a stopped run can resume; other facts are an error.
+Run metadata is what results depend on: device, machine, commit, versions, settings. A record is
+written after every result, so that a stopped run can resume; with other metadata it raises.
 """
 
 from __future__ import annotations
@@ -33,12 +33,12 @@ Row = TypeVar("Row")
 
 
 class Record(Generic[Row]):
-    """Results of a measurement (rows) and the facts of its run, with their JSON file, if any."""
+    """Results of a measurement (rows), the run metadata (`facts`), and their JSON file, if any."""
 
     command: str
     """The command of `npa-envs` that writes such records, for messages of errors."""
     key = "facts"
-    """Key in the file of the facts of the run."""
+    """Key of the run metadata in the file."""
 
     def __init__(
         self, facts: Mapping[str, Any], path: Path | None = None, rows: Iterable[Row] = ()
@@ -46,7 +46,7 @@ class Record(Generic[Row]):
         self.facts, self.path, self.rows = facts, path, list(rows)
 
     def content(self) -> Mapping[str, Any]:
-        """Return the fields of the file except the facts of the run, for JSON."""
+        """Return the fields of the file except the run metadata, for JSON."""
         return {"rows": as_objects(self.rows)}
 
     def parse(self, content: dict[str, Any]) -> list[Row]:
@@ -87,7 +87,7 @@ def read_record(
 ) -> Content | None:
     """Return `parse` of the JSON object in a file; None if the file does not exist.
 
-    If it is not a record, or the facts of its run (under `key`) differ from `facts`, an NPAError is
+    If it is not a record, or its run metadata (under `key`) differs from `facts`, an NPAError is
     raised, which names the `command` of `npa-envs`.
     """
     if not os.path.exists(path):
@@ -122,11 +122,11 @@ def time_limit(max_seconds: float | None) -> Callable[[], bool]:
     return lambda: time.monotonic() >= end
 
 
-# Facts
+# Run metadata
 
 
 def measured_facts(device: torch.device, commit: str | None, **settings: Any) -> dict[str, Any]:
-    """Return a run's facts: device, settings, commit (None: the checkout's), versions, ..."""
+    """Return run metadata: device, settings, commit (None: the checkout's), versions, ..."""
     return {
         "device": device.type,
         "machine": machine(device),
@@ -237,7 +237,7 @@ def _cell(value: object, missing: str) -> str:
 
 
 def tables_json(tables: Mapping[str, Sequence[Any]], **facts: str) -> str:
-    """Return tables of rows by name, and `facts`, as JSON; infinite numbers and NaN become null."""
+    """Return tables of rows by name and run metadata as JSON; infinite numbers and NaN are null."""
     return json_text({**facts, **{name: as_objects(rows) for name, rows in tables.items()}})
 
 

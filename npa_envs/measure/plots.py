@@ -106,8 +106,7 @@ def heat_map(matrices: Mapping[str, Matrix], *, colours: str, largest: float) ->
 def number_plainly(axis: Any, values: Sequence[float] | None = None) -> None:
     """Label a logarithmic axis with plain numbers at `values`, or at 1, 2 and 5 of each decade.
 
-    Of a range of two decades or more only decades are labelled. Labels have k or M for thousands
-    and millions.
+    Of two decades or more only decades are labelled. Labels have k for thousands, M for millions.
     """
     from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, NullLocator
 

@@ -24,7 +24,6 @@ from npa_envs.ops.physics import Physics
 Arguments = ParamSpec("Arguments")
 Result = TypeVar("Result")
 
-
 _transforms_active = torch._C._are_functorch_transforms_active
 
 DIRECT_TYPES = {Tensor, nn.Parameter, Physics, torch.dtype, bool, int, float, str, list, NoneType}
@@ -118,7 +117,7 @@ class CustomOp(Generic[Arguments, Result]):
         return unpacked
 
     def __call__(self, *args: Arguments.args, **kwargs: Arguments.kwargs) -> Result:
-        """Call the function, or the torch operator where torch has to see one."""
+        """Call the function, or the torch operator in the cases that the class names."""
         assert not kwargs, "arguments are positional"
         if forward_ad._current_level >= 0:
             _check_tangents(dict(zip(self._signature.parameters, args, strict=False)))

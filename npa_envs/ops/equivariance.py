@@ -1,4 +1,4 @@
-"""The vectors of equivariant rules: rotation-invariant inputs, and displacements from vectors.
+"""Equivariant rules: products of mixed vectors as inputs, and gated displacements.
 
 Perceived vectors v are a particle's gradients; mixed vectors u = mixing^T v are linear combinations
 of them. A rotation of the world rotates all vectors. It leaves the products u_a · u_b unchanged, in

@@ -119,8 +119,7 @@ def compute_densities(
             block_dim=LIST_BLOCK,
         )
     no_gradient = positions.new_empty(0, plan.space_dim, dtype=torch.float64)
-    lists = NeighbourLists(layout, differences, lengths, records)
-    return Densities(particles, no_gradient, lists)
+    return Densities(particles, no_gradient, NeighbourLists(layout, differences, lengths, records))
 
 
 def compute_densities_in_cells(plan: KernelPlan, ordered: SortedWorlds) -> Densities:
@@ -175,8 +174,7 @@ def perception_launch(
         row_index = ordered.row_index[first_row:]
         if lists is not None:
             differences = lists.index_differences[first_row // INTERLEAVED_LISTS :]
-            lengths = lists.lengths[first_row:]
-            lists = lists._replace(index_differences=differences, lengths=lengths)
+            lists = lists._replace(index_differences=differences, lengths=lists.lengths[first_row:])
     group_count, rows, outputs = plan.group_count, (row_index, destination), (out, row_kernel_sum)
     numbers = (
         plan.state_dim,

@@ -340,7 +340,7 @@ def _sort_by_blocks(
     mask: Tensor | None,
     ordered: SortedWorlds,
 ) -> None:
-    """Write small worlds on CUDA to `ordered` in one launch, one block for each slice."""
+    """Write small worlds on CUDA to `ordered` in one launch; a block sorts a slice of a world."""
     slices = slice_count(x.device, plan.world_count, plan.particle_count)
     block = BLOCKS[capacity]
     launch(

@@ -1,4 +1,4 @@
-"""Files of 3D worlds for other programs: point clouds (PLY) and Gaussian splats (PLY, .splat)."""
+"""Writers of 3D worlds for other programs: point clouds (PLY), Gaussian splats (PLY, .splat)."""
 
 from __future__ import annotations
 

@@ -123,8 +123,7 @@ def load_rule(source: str | Path, *, device: str | torch.device = "cpu") -> NPAR
 def save_rule(
     rule: NPARule, path: str | Path, *, metadata: Mapping[str, str] | None = None
 ) -> None:
-    """Write a rule with all its hyper-parameters to a `.safetensors` file, completely or not at
-    all.
+    """Write a rule with all hyper-parameters to a `.safetensors` file, completely or not at all.
 
     The same rule and metadata give the same bytes.
 

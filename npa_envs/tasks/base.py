@@ -57,7 +57,7 @@ class TaskConfig:
     """Pixels on each side of a world's picture, R."""
 
     overflow_weight: float = 100.0
-    """Weight of the penalty of states outside of [-1, 1], mean |s − clip(s, −1, 1)|
+    """Weight of the penalty of states beyond [-1, 1], mean |s − clip(s, −1, 1)|
     (dimensionless)."""
 
     def __post_init__(self) -> None:
@@ -287,7 +287,7 @@ class ParticleTask(Generic[ConfigT]):
     def penalties(self, worlds: Particles) -> dict[str, tuple[float, Tensor]]:
         """Return the other terms of the loss: name -> (weight, term of shape []).
 
-        By default it is "overflow", of states outside of [-1, 1].
+        By default it is "overflow", of states beyond [-1, 1].
         """
         outside = (worlds.s - worlds.s.clamp(-1.0, 1.0)).abs().mean()
         return {"overflow": (self.config.overflow_weight, outside)}
@@ -450,8 +450,7 @@ class GrowthTask(ParticleTask[GrowthConfigT]):
     def penalties(self, worlds: Particles) -> dict[str, tuple[float, Tensor]]:
         """Return the penalties "motion", "overflow" and "bound" and, if weighted, "stray".
 
-        They are of path lengths, of states and positions outside of [-1, 1], and of path lengths
-        there.
+        They are of path lengths, of states and positions beyond [-1, 1], of path lengths there.
         """
         config, bounded = self.config, self.bounded(worlds.x)
         terms = {"motion": (config.motion_weight, distances_moved(worlds).mean())}

@@ -185,7 +185,7 @@ class Morphogenesis3D(GrowthTask[Morphogenesis3DConfig]):
         self._similarity = MultiScaleSimilarity(side, device=device) if with_similarity else None
 
     def for_rule(self, rule: NPARule) -> Self:
-        """Return a copy of the task that draws particles by a rule's read-out, if it has one."""
+        """Return a copy of the task whose pictures use a rule's read-out, if it has one."""
         if rule.readout_dim not in (0, OUTPUTS):
             raise NPAError(
                 f"the rule must have a read-out of {OUTPUTS} outputs, or none, got readout_dim="
@@ -226,7 +226,7 @@ class Morphogenesis3D(GrowthTask[Morphogenesis3DConfig]):
         return self._draw(x, self.gaussians(s), cameras)
 
     def picture(self, x: Tensor, s: Tensor) -> Tensor:
-        """Return one of the `views` of each world, [B, R, R, 4], with the bottom row first."""
+        """Return worlds by the camera nearest `SHOWN_FROM`, [B, R, R, 4], bottom row first."""
         return self.views(x, s, self._shown.cameras)[:, 0].flip(1)
 
     def metric(self, x: Tensor, s: Tensor) -> Tensor:

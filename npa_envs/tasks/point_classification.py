@@ -178,7 +178,7 @@ class PointClassification(ParticleTask[PointClassificationConfig]):
         return Particles(x, x.new_zeros(*x.shape[:2], config.state_dim), goal=goal)
 
     def damage(self, worlds: Particles, generator: Randomness) -> Particles:
-        """Return worlds; a fraction `mutated_share` gets positions and class of another cloud."""
+        """Return worlds; a fraction `mutated_share` of them gets another cloud and its class."""
         x, probability = worlds.x, self.config.mutated_share
         if worlds.goal is None or probability == 0.0:
             return worlds

@@ -258,7 +258,7 @@ class TrainConfig(Generic[TaskConfigT]):
 
     @property
     def fresh_count(self) -> int:
-        """Number of initial worlds in a batch that contains some, by `fresh_share`."""
+        """Initial worlds in a batch that has any: `fresh_share` of its worlds, and at least one."""
         return max(1, round(self.fresh_share * self.world_count))
 
     @property

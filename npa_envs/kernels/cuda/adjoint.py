@@ -218,7 +218,7 @@ def listed_adjoint(
     """Return the backward kernels of perception that compute dL/d(states), by name.
 
     They are for a box if `periodic`, else for open space, and for several groups of `width`
-    channels if `grouped`. The gradients by perception of a row and group are contiguous, [1 + D,
+    channels if `grouped`. The cotangents of a row's perception of a group are contiguous, [1 + D,
     width]: of the smoothed state, then of the state gradient. Zeros follow those of the last row.
     """
     options = {"gradient": state_gradient, "periodic": periodic, "grouped": grouped}

@@ -180,6 +180,7 @@ def listed_density(
             end = load_integer(starts, base + last)
             far = far or (begin < end and wp.max(k - begin, end - k) > MAX_STEP)
             j = begin + lane
+            # Candidates j to `end`; while `crowded`, terms after `stop` get a new sum.
             crowded = wp.bool(True)
             while crowded:
                 stop = end
@@ -188,7 +189,7 @@ def listed_density(
                     # Worlds whose particles have several threads are smaller.
                     stop = wp.min(end, j + wp.static(TERMS_PER_SUM))
                     crowded = stop < end
-                # Several positions are loaded before the first is used.
+                # `ahead`: positions, all loaded before the first is used.
                 while j + wp.static((many - 1) * lanes) < stop:
                     ahead = positions_ahead()
                     for a in range(wp.static(many)):
@@ -203,6 +204,7 @@ def listed_density(
                 if crowded:
                     earlier += total
                     total = scalar(0.0)
+            # The rest, fewer than `many`: those from `end` on count 0.
             if j < end:
                 ahead = positions_ahead()
                 for a in range(wp.static(many - 1)):
@@ -275,7 +277,7 @@ def tiled_density(periodic: bool, capacity: int, masked: bool) -> wp.Kernel:
         lists: wp.array3d[wp.int16],
         list_lengths: wp.array[wp.int32],
     ):
-        """Write what the kernel of `listed_density` writes; each list is contiguous."""
+        """Write positions, volumes and lists as `listed_density` does; each list is contiguous."""
         wait_for_previous_kernel()
         thread = thread_number()
         tile = thread >> wp.static(WARP.bit_length() - 1)

@@ -1,9 +1,8 @@
-"""Vectors of equivariant rules on CUDA, in float32: a warp shares a few rows.
+"""Products of mixed vectors and gated displacements, on CUDA in float32: a warp has a few rows.
 
 The formulas are those of `npa_envs/ops/equivariance.py`. Compared with
 `kernels/portable/equivariance.py` there are fewer passes over rows, and one of them also computes
 the gradient of the mixing weights.
-Names: `x_bar` = dL/dx, the gradient of the loss L with respect to x.
 """
 
 from types import SimpleNamespace

@@ -36,9 +36,8 @@ WIDE, WIDE_REGISTERS = range(81, 97), 128
 def two_layer_kernel(column_blocks: int, tiles: int, mode: str) -> wp.Kernel:
     """Return the kernel that applies a network of two layers to rows; a warp serves 16 rows.
 
-    Rows have at most 16 `column_blocks` columns, outputs at most 8 `tiles`. `mode` "relu" applies ReLU to
-    hidden units, "relu_store_mask" also stores its mask, "apply_mask" applies a stored mask
-    instead.
+    Rows have at most 16 `column_blocks` columns, outputs 8 `tiles`. `mode` "relu" applies ReLU to
+    hidden units, "relu_store_mask" also stores its mask, "apply_mask" applies a stored one.
 
     Arguments: number of hidden units H, a multiple of 16; rows [K, width]; weights of both layers,
     from `arrange_hidden` and `arrange_output`; scales of the outputs [8 `tiles`]; `signs`, the
@@ -79,10 +78,10 @@ def weight_gradient_kernels(
 ) -> SimpleNamespace:
     """Return two kernels: both layers' weight gradients, summed over ranges of rows; their total.
 
-    Rows have 16 `column_blocks` or 8 `tiles` columns, gradients with respect to outputs 8 `out_tiles`, masks `words`
-    words. A block sums a range of rows for 1 / `unit_blocks` of the hidden units, each of its
-    `warps` for `WARP_UNITS`. It recomputes hidden units and gradients by them, transposed, as left
-    operands of the weight gradients' products. Numbers are pairs of bfloat16, which need no
+    Rows have 16 `column_blocks` or 8 `tiles` columns, their `output_bar` 8 `out_tiles`, masks
+    `words` words. A block sums a range of rows for 1 / `unit_blocks` of the hidden units, each of
+    its `warps` for `WARP_UNITS`. It recomputes hidden units and their cotangents, transposed, as
+    left operands of the weight gradients' products. Numbers are pairs of bfloat16, which need no
     scaling: scales differ among rows, and sums run over rows.
     """
     variant = f"{column_blocks}_{tiles}_{out_tiles}_{warps}_{unit_blocks}_{words}"

@@ -222,7 +222,7 @@ def tile_kernels(scalar: type) -> SimpleNamespace:
         # outputs
         tile_bars: wp.array[bar_type],
     ):
-        """Write the gradients by a tile's Gaussians, each at the index `pair_slots` of its pair."""
+        """Write a tile's gradients with respect to Gaussians, each at `pair_slots` of its pair."""
         tile = range_start + wp.tid()
         image = tile / frame.tile_count
         begin = starts[tile]
@@ -337,7 +337,7 @@ def block_kernels(scalar: type) -> SimpleNamespace:
         # outputs
         tile_bars: wp.array[scalar],
     ):
-        """Write the gradients by a tile's Gaussians, each at the index `pair_slots` of its pair.
+        """Write a tile's gradients with respect to Gaussians, each at `pair_slots` of its pair.
 
         A block serves a tile; all its threads go through all pairs, as they sum together.
         """

@@ -149,7 +149,7 @@ def gaussian_functions(scalar: type) -> SimpleNamespace:
 
     @wp.func
     def pull_back_rotation(q: quad, bar: cube):
-        """Return the loss gradient by a unit quaternion from `bar`, that by its rotation matrix."""
+        """Return dL/dq of a unit quaternion q; `bar` is dL/dR of its rotation matrix R."""
         w = q[0]
         x = q[1]
         y = q[2]
@@ -429,7 +429,7 @@ def adjoint_kernel(scalar: type, module: wp.Module) -> wp.Kernel:
         opacities_bar: wp.array[scalar],
         colours_bar: wp.array2d[scalar],
     ):
-        """Write loss gradients by Gaussians: sums over views and, in each view, over tiles."""
+        """Write Gaussians' cotangents: sums over views and, in each view, over tiles."""
         i = range_start + wp.tid()
         world = i / frame.particle_count
         mean = means[i]

@@ -504,7 +504,7 @@ def scattering_kernel(scalar: type, module: wp.Module) -> wp.Kernel:
 
 
 def adjoint_kernel(scalar: type, lanes: int, module: wp.Module) -> wp.Kernel:
-    """Return the backward kernel: loss gradients by particles' positions and colours."""
+    """Return the backward kernel, of gradients with respect to positions and colours."""
     types, splat = splat_types(scalar), splat_functions(scalar)
     vector, colour_type, bar_type = types.vector, types.colour, types.splat_bar
     load_footprint, load_colour = make_wide_load(types.footprint), make_wide_load(colour_type)
@@ -523,7 +523,7 @@ def adjoint_kernel(scalar: type, lanes: int, module: wp.Module) -> wp.Kernel:
         positions_bar: wp.array[vector],
         colours_bar: wp.array2d[scalar],
     ):
-        """Write loss gradients by particles' positions and colours, from those by pixels."""
+        """Write loss gradients with respect to positions and colours, from those of pixels."""
         k, lane = wp.tid()
         k += range_start
         world = k / particle_count

@@ -14,5 +14,5 @@ are numbered in sorted order: a number is a row, of perception and of updates.
   Kernels that sort leave out the rows, or the sorted states, where these arrays are empty.
 - `width`, `group_count`: channels of a group; groups that the channels of a state fill.
 - `aligned`: 1 if adjacent channels can be read at once; `moving`: 0 if only states change.
-- `x_bar`: dL/dx, the gradient of the loss L by x, called a cotangent; shaped like x.
+- `x_bar`: dL/dx, the gradient of the loss L with respect to x, called its cotangent; shaped like x.
 """

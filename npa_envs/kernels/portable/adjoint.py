@@ -63,7 +63,7 @@ def unscaling_kernel(space: SimpleNamespace, module: wp.Module, state_gradient: 
     def unscaled(
         perception: wp.array2d[scalar], perception_bar: wp.array2d[scalar], row: int, column: int
     ):
-        """Return the loss gradient by the vector whose logarithmic scaling begins at `column`."""
+        """Return dL/dv of the vector v whose logarithmic scaling begins at `column`."""
         scaled = vector()
         bar = vector()
         for d in range(wp.static(space_dim)):

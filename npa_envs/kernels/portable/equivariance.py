@@ -1,4 +1,4 @@
-"""Vectors of equivariant rules: mixed, rotation-invariant products, displacements from gates.
+"""Products of mixed vectors, which rotations do not change, and gated displacements.
 
 `npa_envs/ops/equivariance.py` has the formulas, `kernels/portable/__init__.py` the arguments. A
 thread computes a few numbers of a row.

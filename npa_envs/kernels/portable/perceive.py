@@ -209,9 +209,9 @@ def perception_kernels(
         k, g = wp.tid()
         k += range_start
         i = original_index[k]
-        no_list = starts
+        unused = starts  # in place of neighbour lists: all cells are searched
         smoothed, gradient, _kernel_sum, moment = sum_neighbours(
-            domain, particle_count, starts, no_list, no_list, particles, states, k, g, group_count
+            domain, particle_count, starts, unused, unused, particles, states, k, g, group_count
         )
         straight = corrected(gradient, moment)
         for c in range(wp.static(width)):

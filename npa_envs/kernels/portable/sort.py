@@ -155,7 +155,7 @@ def sort_kernels(space_dim: int, scalar: type, width: int) -> SimpleNamespace:
         row_positions: wp.array[vector],
         sorted_states: wp.array[group],
     ):
-        """Sort a world by cell, then index, in one thread, as the three other kernels do."""
+        """Sort a world by cell, then index, in one thread: same result as the kernels above."""
         world = range_start + wp.tid()
         first = world * particle_count
         end = first + particle_count

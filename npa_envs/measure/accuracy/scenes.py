@@ -195,7 +195,7 @@ PRECISIONS = {"float32": torch.float32, "float64": torch.float64}
 
 
 class PerceptionOutcome(NamedTuple):
-    """A perception z, [B, N, P], and gradients of a functional of it by states and positions."""
+    """A perception z, [B, N, P], and gradients of a functional of it, of states and positions."""
 
     z: Tensor
     states: Tensor
@@ -223,7 +223,7 @@ def perception_errors(
 def against_reference(
     x: Tensor, s: Tensor, box: Box, device: torch.device
 ) -> tuple[PerceptionOutcome, PerceptionOutcome]:
-    """Return perception and gradients by the library (float32, on `device`), and the reference."""
+    """Return perception and gradients of the library (float32, on `device`), and the reference."""
     outcome = perceived(x.to(device, torch.float32), s.to(device, torch.float32), box)
     return outcome, perceived(x.cpu().double(), s.cpu().double(), box, by_reference=True)
 

@@ -107,7 +107,7 @@ BOUNDS = {
 
 - `not_finite`: how many numbers of positions and states are infinite or NaN.
 - `extent`: longest side of the particles' bounding box / that of the settled world.
-- `overflow`: mean |s - clip(s, -1, 1)|, how far states lie outside of [-1, 1].
+- `overflow`: mean |s - clip(s, -1, 1)|, how far states are beyond [-1, 1].
 - `largest_state`: the largest |s|.
 - `energy`: mean over particles of a step's |Δx|²/ε² + mean Δs² / that of the settled world.
 - `drift`: distance of the centroid from the settled one's / settled extent; in open space only.

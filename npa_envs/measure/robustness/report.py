@@ -92,7 +92,7 @@ class RuleRecord(Record[Response]):
         return bool(self.about["done"])
 
     def content(self) -> dict[str, Any]:
-        """Return the fields of the file except the facts of the run, for JSON."""
+        """Return the fields of the file except the run metadata, for JSON."""
         curves = [asdict(curve) for curve in self.curves]
         for fields, curve in zip(curves, self.curves, strict=True):
             fields["twins"] = fields.pop("undamaged")
@@ -115,11 +115,11 @@ class RuleRecord(Record[Response]):
         return [Response(**row | {"losses": numbers(row["losses"])}) for row in rows]
 
     def responses_to(self, condition: str) -> list[Response]:
-        """Return the responses at the values of a condition, in order."""
+        """Return the seeds' losses at each value of a condition, in the order of measurement."""
         return [response for response in self.rows if response.condition == condition]
 
     def trained(self) -> Response:
-        """Return the response under the conditions of training."""
+        """Return the seeds' losses under the conditions of training."""
         return next(response for response in self.responses_to("eps") if response.value == 1.0)
 
 

@@ -1,4 +1,4 @@
-"""The kernels of a step: their times (suite `kernels`), and why they were chosen (`explain`)."""
+"""Kernels of a step: time of each (suite `kernels`), reasons for their choice (`--explain`)."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ def kernel_rows(session: TimingSession, workloads: Sequence[Workload]) -> list[K
 
 
 Gradients = Literal["none", "weights", "positions"]
-"""Which gradients a step computes: none, by weights and states, or also by positions."""
+"""Which gradients a step computes: none, of weights and states, or also of positions."""
 
 
 def explain(

@@ -1,4 +1,4 @@
-"""Workloads of `npa-envs bench`, time and memory of a call, and the session of a run."""
+"""What `npa-envs bench` times (workloads), how it times (time, memory), and a run's session."""
 
 from __future__ import annotations
 
@@ -86,8 +86,8 @@ def rollout_call(
 ) -> tuple[Callable[[], None], torch.Generator]:
     """Return a function that runs a workload's rollout from x and s, and its masks' generator.
 
-    With `train` it also computes the gradient of a random linear functional of the result by the
-    rule's weights; with `gradients` it only records what a gradient needs. `rule` are options of
+    With `train` it also computes the rule's weight gradients of a random linear functional of the
+    result; with `gradients` it only records what a gradient needs. `rule` are options of
     `NPARule`, `options` those of `roll`, the function that is timed.
     """
     network = workload.rule(x.device, **(rule or {}))

@@ -69,7 +69,7 @@ def check_loss_name(name: str) -> None:
 
 
 def is_joint(name: str) -> bool:
-    """Return whether a loss, or a sum such as "patch_ot+joint_swd", has `LossEntry.joint`."""
+    """Return whether a loss, or a sum of losses with "+", compares colours and density at once."""
     return TEXTURE_LOSSES[name.split("+")[0]].joint
 
 
@@ -109,7 +109,7 @@ MIN_IMAGE_SIDE = 12
 """Minimum side of the smallest of these [pixels]."""
 
 MAX_POSITIONS = 64
-"""Maximum number of positions along each side that sliced distances compare in thinned images."""
+"""Maximum number of positions along each side that sliced distances compare if `thinned`."""
 
 ALIGNMENT = 64
 """Addresses of matrices that are multiplied are multiples of this [bytes]."""
@@ -170,7 +170,7 @@ def pyramid(images: Tensor, count: int) -> list[Tensor]:
 
 
 def stride_of(level: Tensor, thinned: bool) -> int:
-    """Return the distance [pixels] between compared positions; without `thinned` it is 1."""
+    """Return the stride [pixels] between compared patches: 1, or if `thinned` 1 or more."""
     return max(1, level.shape[-1] // MAX_POSITIONS) if thinned else 1
 
 

@@ -72,8 +72,7 @@ def load_clouds(
 ) -> PointClouds:
     """Return a cloud of `particle_count` points for each picture of a data set.
 
-    `load_pictures` explains `data`, `split` and `folder`, `sample_ink` the points. Results are
-    cached.
+    `load_pictures` explains `data`, `split`, `folder`; `sample_ink` the points. Results are cached.
     """
     ink, label = load_pictures(data, split, folder=folder)
     x, area = sample_ink(ink, particle_count, sample_seed=sample_seed, device=device)

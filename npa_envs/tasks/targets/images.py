@@ -174,8 +174,7 @@ def cut_out_background(image: Image.Image, *, label: str) -> Image.Image:
 def resample(image: Image.Image, point_count: int, *, label: str = "picture") -> Image.Image:
     """Return an RGBA picture scaled so that about `point_count` of its pixels are opaque.
 
-    It is padded to a square. Colours are means with alpha as weight. Errors call the picture
-    `label`.
+    It is padded to a square. Colours are means weighted by alpha. Errors call the picture `label`.
     """
     padded, span, pitch = _padded(image.crop(image.getchannel("A").getbbox()), point_count)
     return _sample(padded, span, _best_pitch(padded, span, pitch, point_count, label))

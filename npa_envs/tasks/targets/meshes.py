@@ -1,4 +1,4 @@
-"""Coloured triangle meshes: built-in ones, and files read by trimesh; pictures of meshes."""
+"""Coloured triangle meshes: built-in ones, and mesh files, and pictures of them by cameras."""
 
 from __future__ import annotations
 
@@ -157,9 +157,8 @@ view may have more."""
 def draw_mesh(mesh: Mesh, cameras: Cameras) -> NDArray[np.float32]:
     """Return pictures of a mesh by V cameras, [V, H, W, 4]: colours times alpha, alpha, in [0, 1].
 
-    Surfaces are matt and lit from a direction that is fixed in the world. Both sides of a triangle
-    are visible. Triangles with a vertex nearer than `cameras.near` are left out. The first row is
-    the top.
+    Surfaces are matt and lit from a direction fixed in the world. Both sides of triangles are
+    visible. Triangles with a vertex nearer than `cameras.near` are left out. The top row is first.
     """
     light = np.asarray(LIGHT) / np.linalg.norm(LIGHT)
     lit = AMBIENT + (1.0 - AMBIENT) * (mesh.normals() @ light).clip(0.0, 1.0)
