@@ -201,7 +201,7 @@ def _healing_row(damage: str, before: Tensor, steps: Sequence[int], losses: Tens
 # Rules that classify clouds
 
 CLOUD_CHECKPOINTS = (8, 16, 24, 32, 64, 128)
-"""Default steps from zero states at which particles' votes are read."""
+"""Default steps from zero states at which particles' predictions are read."""
 
 CUT_FRACTION = 0.25
 """Fraction of its particles that a cut cloud loses."""
@@ -212,11 +212,11 @@ CLOUD_BATCH = 256
 
 @dataclass(frozen=True)
 class AccuracyRow:
-    """How particles, which vote for the class of their cloud, vote `step` steps after zero states.
+    """Classes of clouds that their particles predict, `step` steps after zero states.
 
-    Fractions in [0, 1]: `majority`, of clouds whose majority votes for the right class; `particle`,
-    of particles that do; `agreement`, of particles that vote as their cloud's majority. `loss` is
-    the task's metric, `overflow` mean |s - clip(s, -1, 1)|.
+    Fractions in [0, 1]: `majority`, of clouds whose majority predicts the right class; `particle`,
+    of particles that do; `agreement`, of particles that predict what their cloud's majority does.
+    `loss` is the task's metric, `overflow` mean |s - clip(s, -1, 1)|.
     """
 
     step: int
@@ -229,10 +229,10 @@ class AccuracyRow:
 
 @dataclass(frozen=True)
 class ChangeRow:
-    """Votes of all clouds `steps` steps after their particles were cut off or moved (`change`).
+    """Predictions of all clouds `steps` steps after a `change`: particles were cut off or moved.
 
-    Fractions in [0, 1]: `majority`, of clouds whose majority votes for the class after the change;
-    `particle`, of particles that do; `majority_before`, of clouds that do so for the former class.
+    Fractions in [0, 1]: `majority`, of clouds whose majority predicts the class after the change;
+    `particle`, of particles that do; `majority_before`, of clouds still for the former class.
     """
 
     change: str

@@ -112,7 +112,7 @@ class KernelPlan(NamedTuple):
 
     @property
     def start_count(self) -> int:
-        """Length of `SortedWorlds.starts`: one or, with a mask, two entries a cell, and the end."""
+        """Length of `SortedWorlds.starts`: 1 + number of cells, with a mask 1 + twice that."""
         return self.cell_total + self.active_offset + 1
 
     @property

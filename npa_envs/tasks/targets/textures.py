@@ -79,7 +79,7 @@ class TextureTarget:
 
     @property
     def mean_colour(self) -> Tensor:
-        """Mean red, green and blue of the covered part (dimensionless), shape [3]."""
+        """Mean red, green and blue where particles should be (dimensionless), shape [3]."""
         sums = self.picture.double().sum(dim=(0, 1))
         return (sums[:3] / sums[3]).to(self.picture)
 
