@@ -163,7 +163,7 @@ class CallGroup:
 
     def __init__(self) -> None:
         self.calls, self.failed_captures = 0, 0
-        # Captures, or `RecordedSteps`, that are not in use.
+        # Captures, or `ReplayedSteps`, that are not in use.
         self.free: collections.deque[Any] = collections.deque()
         self.captures: list[CapturedRollout] = []
         # Whether calls of this group cannot be captured.

@@ -25,12 +25,15 @@ class Particles(NamedTuple):
         """Return the worlds with path lengths of 0: the tensor `zeros` [B, N], or a new one."""
         if zeros is None:
             zeros = self.x.new_zeros(self.x.shape[:2])
-        # Not by `_replace`: torch.compile cannot trace it.
-        return Particles(self.x, self.s, zeros, *self[3:])
+        return self.with_fields(path_length=zeros)
+
+    def with_fields(self, **values: Tensor | None) -> Particles:
+        """Return the worlds with other values of some fields; unlike `_replace` it compiles."""
+        return Particles(*(values.get(name, getattr(self, name)) for name in self._fields))
 
     def per_particle(self) -> tuple[Tensor, Tensor, Any]:
         """Return x, s and the path lengths, in the order that `update_particles` takes."""
-        return self[:-1]
+        return self.x, self.s, self.path_length
 
     def tensors(self) -> list[Tensor]:
         """Return the fields that are not None."""

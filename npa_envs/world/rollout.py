@@ -314,11 +314,11 @@ def run_rules(
             steps, constants, detach_positions, memory, keep_every, tuple(species), per_species
         ),
         rules,
-        Particles(*worlds[:-1]),
+        worlds.with_fields(goal=None),
         generator,
         cuda_graph=cuda_graph,
         watch=make_watch(on_divergence, worlds),
-        may_rest=not return_path_length,
+        return_path_length=return_path_length,
     )
     path_length = after.path_length if return_path_length else None
-    return Particles(after.x, after.s, path_length, *after[3:-1], worlds.goal)
+    return after.with_fields(path_length=path_length, goal=worlds.goal)

@@ -1,12 +1,12 @@
 """How a rollout runs: one of several ways, which all have the same results.
 
-`execute` takes the first way whose condition is met:
+A rollout takes the first way whose condition is met; `run_all_steps` is the last three of them:
 
 | way                      | condition                                      | code                 |
 |--------------------------|------------------------------------------------|----------------------|
-| skip steps once at rest  | rule with dead zone, no gradients, many steps  | `_run_until_rest`    |
+| skip steps once at rest  | rule with dead zone, no gradients, many steps  | `execute`            |
 | replay CUDA graphs       | CUDA, third call on                            | capture_cache.py     |
-| replay recorded launches | CPU, no gradients, small worlds, third call on | recorded_rollout.py  |
+| replay recorded launches | CPU, no gradients, small worlds, third call on | replayed_launches.py |
 | launch each step         | none                                           | `RolloutSpec.launch` |
 
 "Third" counts calls with the same shapes and options. What a step is, `RolloutSpec.make_step`
@@ -15,7 +15,7 @@ chooses: one of several species, of static or dividing particles, or of one rule
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, Literal, NamedTuple
 
 import torch
@@ -31,7 +31,7 @@ from npa_envs.world.cuda_graph import draws_alone
 from npa_envs.world.divergence import DivergenceWatch
 from npa_envs.world.particles import Particles, combined
 from npa_envs.world.randomness import Randomness
-from npa_envs.world.recorded_rollout import run_recorded
+from npa_envs.world.replayed_launches import replay_launches
 from npa_envs.world.steps import (
     DivisionStep,
     RuleStep,
@@ -63,33 +63,29 @@ def execute(
     particles: Particles,
     generator: Randomness | None,
     *,
-    cuda_graph: CudaGraph = "auto",
-    watch: DivergenceWatch | None = None,
-    may_rest: bool = True,
+    cuda_graph: CudaGraph,
+    watch: DivergenceWatch | None,
+    return_path_length: bool,
 ) -> Particles:
-    """Run a checked rollout in the fastest way that its options allow; return the last worlds.
+    """Run a checked rollout, and return what `run_all_steps` does.
 
-    With `spec.keep_every` it returns the worlds kept, stacked along a new first dimension. With a
-    watch, each step is launched and then checked for divergence. With `may_rest`, steps may be
-    skipped once all worlds are at rest.
+    Without a watch and path lengths it skips the steps after all worlds have come to rest.
     """
-    if watch is None:
-        if may_rest and _can_rest(spec, rules, particles.x):
-            return _run_until_rest(spec, rules, particles, generator, cuda_graph)
-        replayed = run_captured(spec, rules, particles, generator, cuda_graph=cuda_graph)
-        if replayed is not None:
-            return replayed
-    check_finite_positions(particles.x)
-    if particles.x.is_cuda and torch.is_grad_enabled():
-        # Gradients are added in the order of a capture: first those of this rollout.
-        particles = particles.map(lambda value: value.view_as(value))
-    particles = particles.with_zero_paths()
-    step = spec.make_step(rules, particles)
-    if watch is None and type(step) is RuleStep:
-        replayed = run_recorded(step, particles, generator, spec.steps, spec.keep_every)
-        if replayed is not None:
-            return replayed
-    return spec.launch(step, rules, particles, generator, watch)
+    if watch is not None or return_path_length or not _can_rest(spec, rules, particles.x):
+        return run_all_steps(spec, rules, particles, generator, cuda_graph, watch)
+    remaining, steps = spec.steps, FIRST_PART[particles.x.device.type]
+    while remaining and not resting(rules, particles, spec.physics, cuda_graph).all():
+        part = spec._replace(steps=min(steps, remaining))
+        particles = run_all_steps(part, rules, particles, generator, cuda_graph)
+        remaining, steps = remaining - part.steps, 2 * steps
+        if remaining and not particles.x.isfinite().all():
+            # A world has diverged: the next call raises an error for it, this one does not.
+            part, particles = spec._replace(steps=remaining), particles.with_zero_paths()
+            return part.launch(part.make_step(rules, particles), rules, particles, generator)
+    # The generator ends where it would be after all steps.
+    skip_draws(particles.x, spec.physics, remaining, generator)
+    # The caller may write to the results.
+    return particles.map(torch.clone) if remaining == spec.steps else particles
 
 
 def _can_rest(spec: RolloutSpec, rules: Sequence[NPARule], x: Tensor) -> bool:
@@ -109,39 +105,43 @@ def _can_rest(spec: RolloutSpec, rules: Sequence[NPARule], x: Tensor) -> bool:
     )
 
 
-def _run_until_rest(
-    spec: RolloutSpec,
-    rules: Sequence[NPARule],
-    particles: Particles,
-    generator: Randomness | None,
-    cuda_graph: CudaGraph,
-) -> Particles:
-    """Run a rollout in parts of several steps, until all worlds are at rest or steps are done."""
-    remaining, steps = spec.steps, FIRST_PART[particles.x.device.type]
-    while remaining and not resting(rules, particles, spec.physics, cuda_graph).all():
-        part = spec._replace(steps=min(steps, remaining))
-        particles = execute(
-            part, rules, particles, generator, cuda_graph=cuda_graph, may_rest=False
-        )
-        remaining, steps = remaining - part.steps, 2 * steps
-        if remaining and not particles.x.isfinite().all():
-            # A world has diverged: the next call raises an error for it, this one does not.
-            part, particles = spec._replace(steps=remaining), particles.with_zero_paths()
-            return part.launch(part.make_step(rules, particles), rules, particles, generator)
-    # The generator ends where it would be after all steps.
-    skip_draws(particles.x, spec.physics, remaining, generator)
-    # The caller may write to the results.
-    return particles.map(torch.clone) if remaining == spec.steps else particles
-
-
 def resting(
     rules: Sequence[NPARule], particles: Particles, physics: Physics, cuda_graph: CudaGraph
 ) -> Tensor:
     """Return which worlds are at rest: an update of all particles changes none, bool, shape [B]."""
     spec = RolloutSpec(1, physics._replace(update_prob=1.0))
     with torch.no_grad():
-        after = execute(spec, rules, particles, None, cuda_graph=cuda_graph, may_rest=False)
-    return after.equal(particles)
+        return run_all_steps(spec, rules, particles, None, cuda_graph).equal(particles)
+
+
+def run_all_steps(
+    spec: RolloutSpec,
+    rules: Sequence[NPARule],
+    particles: Particles,
+    generator: Randomness | None,
+    cuda_graph: CudaGraph,
+    watch: DivergenceWatch | None = None,
+) -> Particles:
+    """Run all steps in the fastest way that the options allow; return the last worlds.
+
+    With `spec.keep_every` it returns the worlds kept, stacked along a new first dimension. With a
+    watch, each step is launched and then checked for divergence.
+    """
+    if watch is None:
+        replayed = run_captured(spec, rules, particles, generator, cuda_graph=cuda_graph)
+        if replayed is not None:
+            return replayed
+    check_finite_positions(particles.x)
+    if particles.x.is_cuda and torch.is_grad_enabled():
+        # Gradients are added in the order of a capture: first those of this rollout.
+        particles = particles.map(lambda value: value.view_as(value))
+    particles = particles.with_zero_paths()
+    step = spec.make_step(rules, particles)
+    if watch is None and type(step) is RuleStep:
+        replayed = replay_launches(step, particles, generator, spec.steps, spec.keep_every)
+        if replayed is not None:
+            return replayed
+    return spec.launch(step, rules, particles, generator, watch)
 
 
 class RolloutSpec(NamedTuple):
@@ -180,50 +180,47 @@ class RolloutSpec(NamedTuple):
         generator: Randomness | None,
         watch: DivergenceWatch | None = None,
     ) -> Particles:
-        """Launch all steps of checked worlds, and return what `execute` does."""
+        """Launch all steps of checked worlds, and return what `run_all_steps` does."""
+        trajectory: list[Particles] = []
         # Worlds keep their dtype under autocast, as kernels read the rules' outputs.
         with torch.autocast(particles.x.device.type, enabled=False):
-            after = self._launch_steps(step, rules, particles, generator, watch)
+            particles = step.to_step_order(particles)
+            after_each = self._worlds_after_each_step(step, rules, particles, generator)
+            for number, particles in enumerate(after_each, 1):
+                if watch is not None:
+                    watch.check(step.to_caller_order(particles.map(Tensor.detach)))
+                if self.keep_every is not None and number % self.keep_every == 0:
+                    trajectory.append(step.to_caller_order(particles))
+            # Without steps it is a copy, as the caller may write to the results.
+            last = particles if self.steps else particles.map(torch.clone)
+            after = combined(torch.stack, trajectory) if trajectory else step.to_caller_order(last)
         if watch is not None:
             watch.raise_diverged()
         return after
 
-    def _launch_steps(
+    def _worlds_after_each_step(
         self,
         step: Step,
         rules: Sequence[NPARule],
         particles: Particles,
         generator: Randomness | None,
-        watch: DivergenceWatch | None,
-    ) -> Particles:
-        particles = step.to_step_order(particles)
-        interval, restores_random_state = self._recomputation(rules, particles.x)
-        recomputed = None
+    ) -> Iterator[Particles]:
+        """Yield the worlds after each step; by `memory`, the backward pass recomputes some."""
+        interval, restores = self._recomputation(rules, particles.x)
+        advance: Callable[..., Any] = step.advance
         # A compiled function reads copies.
         if interval > 1 and not torch.compiler.is_compiling():
-            recomputed = RecomputedSteps(step.advance, rules, particles)
-        trajectory: list[Particles] = []
+            advance = RecomputedSteps(step.advance, rules, particles)
         for number, draws in enumerate(step.draw(particles.x, self.steps, generator)):
             if (self.steps - 1 - number) % interval == 0:
                 particles = step.advance(particles, draws)
             else:
                 particles = checkpoint(
-                    recomputed or step.advance,
-                    particles,
-                    draws,
-                    use_reentrant=False,
-                    preserve_rng_state=restores_random_state,
+                    advance, particles, draws, use_reentrant=False, preserve_rng_state=restores
                 )
-            if watch is not None:
-                watch.check(step.to_caller_order(particles.map(Tensor.detach)))
-            if self.keep_every is not None and (number + 1) % self.keep_every == 0:
-                trajectory.append(step.to_caller_order(particles))
-        if recomputed is not None:
-            recomputed.store_versions()
-        if self.keep_every is not None:
-            return combined(torch.stack, trajectory)
-        # Without steps it is a copy, as the caller may write to the results.
-        return step.to_caller_order(particles if self.steps else particles.map(torch.clone))
+            yield particles
+        if isinstance(advance, RecomputedSteps):
+            advance.store_versions()
 
     def _recomputation(self, rules: Sequence[NPARule], x: Tensor) -> tuple[int, bool]:
         """Return the interval of stored steps, and whether others restore torch's random state."""

@@ -7,14 +7,14 @@ import torch
 from support.worlds import assert_same, lively_rule, random_world
 
 import npa_envs
-from npa_envs.world import recorded_rollout
+from npa_envs.world import replayed_launches
 
 BOX = (1.4, 1.4)
 
 
 @pytest.fixture(autouse=True)
 def _nothing_prepared(monkeypatch):
-    monkeypatch.setattr(recorded_rollout, "_groups", type(recorded_rollout._groups)())
+    monkeypatch.setattr(replayed_launches, "_groups", type(replayed_launches._groups)())
 
 
 def make_rule(dtype=torch.float32, seed=0, **options):
@@ -37,7 +37,7 @@ def run(rule, x, s, steps=5, *, by_world=False, seed=3, **options):
 
 
 def steps_ready():
-    return [steps for group in recorded_rollout._groups.values() for steps in group.free]
+    return [steps for group in replayed_launches._groups.values() for steps in group.free]
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=str)
@@ -52,7 +52,7 @@ def steps_ready():
     ],
     ids=["open", "box", "few", "by world", "equivariant"],
 )
-def test_recorded_rollouts_are_the_launched_ones(options, dtype):
+def test_replayed_rollouts_are_the_launched_ones(options, dtype):
     options = dict(options)
     chiral = options.pop("equivariant", False)
     rule, (x, s) = make_rule(dtype, equivariant=chiral, chiral=chiral), worlds(dtype)
@@ -69,7 +69,7 @@ def test_worlds_that_lie_otherwise_in_memory_are_stepped_alike():
     expected = [run(rule, x, s), run(rule, *others)]
     views = x.transpose(0, 1).contiguous().transpose(0, 1), s.mT.contiguous().mT
     assert not any(view.is_contiguous() for view in views)
-    recorded_rollout._groups.clear()
+    replayed_launches._groups.clear()
     for _ in range(4):
         assert_same(run(rule, *views), expected[0])
     # The same kind of worlds: what was prepared for views serves these too.
@@ -81,7 +81,7 @@ def test_weights_are_read_anew_and_results_stay():
     starts = [worlds(seed=seed) for seed in range(3)]
     launched = []
     for rule, start in zip(rules, starts, strict=True):
-        recorded_rollout._groups.clear()
+        replayed_launches._groups.clear()
         launched.append(run(rule, *start))
     for _ in range(2):
         run(rules[0], *starts[0])
@@ -126,12 +126,12 @@ def test_threads_step_worlds_of_their_own():
 
 
 def test_groups_are_forgotten_in_turn(monkeypatch):
-    monkeypatch.setattr(recorded_rollout, "MAX_RECORDED_GROUPS", 2)
+    monkeypatch.setattr(replayed_launches, "MAX_REPLAYED_GROUPS", 2)
     rule = make_rule()
     for particle_count in (30, 31, 32):
         for _ in range(3):
             run(rule, *worlds(particle_count=particle_count))
-    assert len(recorded_rollout._groups) == len(steps_ready()) == 2
+    assert len(replayed_launches._groups) == len(steps_ready()) == 2
 
 
 @pytest.mark.parametrize(("world_count", "particle_count"), [(1365, 3), (2048, 2), (1024, 4)])

@@ -1,8 +1,8 @@
-"""On a CPU, repeated rollouts of small worlds replay recorded launches.
+"""Rollouts of small worlds without gradients, on a CPU, that replay the launches of earlier ones.
 
 In a step of such worlds Python takes several times as long as kernels. From the third call with the
-same shapes and options on, a rollout without gradients replays the launches of two steps, which go
-back and forth between two buffers.
+same shapes and options on, a rollout replays the recorded launches of two steps. The first reads
+one buffer and writes another; the second does the reverse.
 """
 
 from __future__ import annotations
@@ -25,14 +25,14 @@ from npa_envs.world.randomness import Randomness
 from npa_envs.world.rule_settings import rule_form
 from npa_envs.world.steps import Draws, RuleStep
 
-MAX_RECORDED_PARTICLES = 4096
+MAX_REPLAYED_PARTICLES = 4096
 """Maximum number of particles B N; the steps of larger batches take most time in kernels."""
 
-MAX_RECORDED_GROUPS = 32
+MAX_REPLAYED_GROUPS = 32
 """Maximum number of groups of calls whose launches are kept."""
 
 
-class _RecordedStep:
+class _ReplayedStep:
     """The recorded launches of one step, which reads one buffer of worlds and writes another.
 
     The network is not recorded: during the recording this object is called in its place.
@@ -57,7 +57,7 @@ class _RecordedStep:
         return self._updates
 
 
-class RecordedSteps:
+class ReplayedSteps:
     """Two recorded steps of worlds of one shape: from a first buffer to a second one, and back."""
 
     def __init__(self, step: RuleStep, particles: Particles) -> None:
@@ -66,8 +66,8 @@ class RecordedSteps:
         self._mask = torch.ones(particles.x.shape[:2], dtype=torch.uint8) if masked else None
         # Contiguous: a copy that a step would have to make is not recorded.
         first = particles.map(lambda value: value.clone(memory_format=torch.contiguous_format))
-        there = _RecordedStep(step, first, self._mask)
-        back = _RecordedStep(step, there.after, self._mask)
+        there = _ReplayedStep(step, first, self._mask)
+        back = _ReplayedStep(step, there.after, self._mask)
         for old, new in zip(back.after.tensors(), first.tensors(), strict=True):
             back.launches.move(back.launches.argument_slots(old), new)
         self._buffers = first, there.after
@@ -99,7 +99,7 @@ _groups = CallGroups()
 _groups_lock = threading.Lock()
 
 
-def run_recorded(
+def replay_launches(
     step: RuleStep,
     particles: Particles,
     generator: Randomness | None,
@@ -116,7 +116,7 @@ def run_recorded(
         torch.compiler.is_compiling()
         or torch.is_grad_enabled()
         or x.device.type != "cpu"
-        or x.shape[0] * x.shape[1] > MAX_RECORDED_PARTICLES
+        or x.shape[0] * x.shape[1] > MAX_REPLAYED_PARTICLES
         or step.network is None
         or step.physics.position_noise > 0.0
         or steps == 0
@@ -128,19 +128,19 @@ def run_recorded(
         return None
     key = (step.physics, rule_form(step.rule), x.shape, s.shape[2], x.dtype)
     with _groups_lock:
-        group = _groups.count(key, MAX_RECORDED_GROUPS)
+        group = _groups.count(key, MAX_REPLAYED_GROUPS)
     if group.calls <= LAUNCHED_FIRST:
         return None
     # Another thread may have taken the last one in the meantime.
     try:
-        recorded = group.free.pop()
+        replayed_steps = group.free.pop()
     except IndexError:
         with torch.inference_mode(False), torch.no_grad():
-            recorded = RecordedSteps(step, particles)
+            replayed_steps = ReplayedSteps(step, particles)
     try:
         masks = (draws.mask for draws in step.draw(x, steps, generator))
         with torch.autocast("cpu", enabled=False):
-            trajectory = recorded.run(step.network, particles, masks, keep_every or steps)
+            trajectory = replayed_steps.run(step.network, particles, masks, keep_every or steps)
     finally:
-        group.free.append(recorded)
+        group.free.append(replayed_steps)
     return trajectory[0] if keep_every is None else combined(torch.stack, trajectory)
