@@ -14,7 +14,7 @@ from torch import Tensor
 from npa_envs.agents.policies import PolicyRandom, unwrapped
 from npa_envs.checks import checked_positive
 from npa_envs.envs.garden.base import GardenTask, TargetDeficit
-from npa_envs.envs.garden.brushes import BrushLayout, grid_places
+from npa_envs.envs.garden.brush_actions import BrushLayout, grid_places
 from npa_envs.envs.shepherd2d import ShepherdTask
 from npa_envs.errors import NPAError
 from npa_envs.world.randomness import StreamId, WorldRandom
@@ -51,7 +51,7 @@ class BrushPolicy:
         return actions if isinstance(array, Tensor) else actions.cpu().numpy()
 
     def act(self) -> Tensor:
-        """Return actions for the environment's B worlds as they are now, float32, [B, J, W]."""
+        """Return actions, float32, [B, J, W]: W columns of `BrushLayout` for each of J brushes."""
         raise NotImplementedError
 
     def still(self) -> Tensor:

@@ -11,7 +11,7 @@ from torch import Tensor
 from npa_envs.checks import check_fraction, check_non_negative, check_positive
 from npa_envs.envs.core.vector import vector_class
 from npa_envs.envs.garden.base import GardenEnv, GardenTask, StartLosses
-from npa_envs.envs.garden.brushes import GardenConfig
+from npa_envs.envs.garden.brush_actions import GardenConfig
 from npa_envs.tasks.damage import random_particle
 from npa_envs.world.brushes import push, wipe_state
 from npa_envs.world.particles import Particles

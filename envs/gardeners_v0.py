@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from npa_envs.envs.core.vector import checked_count
-from npa_envs.envs.garden.brushes import BrushSpaces
+from npa_envs.envs.garden.brush_actions import BrushSpaces
 from npa_envs.envs.gardener2d import Gardener2DEnv, GardenerTask
 from npa_envs.envs.multi.parallel import KnownAgents, Outcome, in_turns, register
 from npa_envs.errors import NPAError, shown

@@ -21,7 +21,7 @@ from npa_envs.envs.core.single import NPAEnv
 from npa_envs.envs.core.task import Start
 from npa_envs.envs.core.vector import vector_class
 from npa_envs.envs.garden.base import coarse
-from npa_envs.envs.garden.brushes import OBSERVATION_LIMIT, GardenReward
+from npa_envs.envs.garden.brush_actions import OBSERVATION_LIMIT, GardenReward
 from npa_envs.envs.morphogenesis2d import PictureConfig
 from npa_envs.envs.trained_rules import (
     OF_PARTICLES,

@@ -17,7 +17,12 @@ from npa_envs.envs.core.base import to_output
 from npa_envs.envs.core.task import Start
 from npa_envs.envs.core.vector import vector_class
 from npa_envs.envs.garden.base import GardenEnv, GardenTask, moments_of
-from npa_envs.envs.garden.brushes import OBSERVATION_LIMIT, BrushSpaces, GardenConfig, GardenReward
+from npa_envs.envs.garden.brush_actions import (
+    OBSERVATION_LIMIT,
+    BrushSpaces,
+    GardenConfig,
+    GardenReward,
+)
 from npa_envs.tasks.seeds import uniform_ball
 from npa_envs.world.environment_steps import Physics
 from npa_envs.world.particles import Particles
@@ -130,7 +135,7 @@ class ShepherdTask(GardenTask[Shepherd2DEnvConfig]):
         return ShepherdEpisode(intact.intact_loss, intact.rise, goal, moments)
 
     def achieved(self, particles: Particles, context: ShepherdEpisode) -> Tensor:
-        """Return the achieved goals, [B, 3]: two values that `aim` names, and lost fractions."""
+        """Return achieved goals, [B, 3]: two values by `aim`, and lost fractions (0: intact)."""
         x, s, *_ = particles
         first, now = context.moments, moments_of(x)
         if self.config.aim == "move":

@@ -1,4 +1,4 @@
-"""Trained rules in environments: rules that grow start worlds, and rules that step worlds."""
+"""Shared code of environments with trained rules, which grow start worlds or step worlds."""
 
 from __future__ import annotations
 
@@ -232,7 +232,7 @@ class RuleDrivenWorlds(BatchedWorlds):
         rewards = self.task.reward(self.particles, self.loss, self.context)
         report = self.episodes.report
         if self.task.rewards_last_step_only:
-            terminated, truncated, *_ = report.endings
+            terminated, truncated, *_ = report.end_flags
             rewards = torch.where(terminated | truncated, rewards, 0.0)
         report.named.reward.copy_(rewards)
         self.task.next_goals(self.episodes.elapsed, self.context, self.goal)

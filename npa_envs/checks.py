@@ -289,6 +289,28 @@ def number_tensor(name: str, value: Any) -> Tensor:
     return numbers
 
 
+def checked_tensor(
+    task: Any,
+    method: str,
+    field: str,
+    value: Any,
+    shape: tuple[int, ...],
+    dtype: torch.dtype = torch.float32,
+) -> Tensor:
+    """Return `value`, which `method` returned as `field`, if it has this shape and type."""
+    device = task.device
+    if not isinstance(value, Tensor):
+        actual = f"a {type(value).__name__}"
+    elif tuple(value.shape) != shape or value.dtype != dtype or value.device.type != device.type:
+        actual = f"{value.dtype} of shape {tuple(value.shape)} on {value.device}"
+    else:
+        return value
+    raise NPAError(
+        f"{field} of {type(task).__name__}.{method} must be a {dtype} tensor of shape {shape} on "
+        f"{device}, got {actual}: reshape or convert it there"
+    )
+
+
 def checked_eps(name: str, eps: float, space_dim: int, dtype: torch.dtype) -> float:
     """Return a perception radius as a float [length units] within its `LENGTH_RANGE`."""
     value = checked_positive(name, eps, " [length units]")

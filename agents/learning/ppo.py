@@ -16,7 +16,7 @@ import weakref
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Literal, NamedTuple, get_args
+from typing import Literal, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -34,7 +34,6 @@ from npa_envs.agents.learning.actor_critic import (
 )
 from npa_envs.agents.learning.problem import (
     WORLDS_PER_SEED,
-    ParticleRewardKind,
     Problem,
     world_seeds,
 )
@@ -42,6 +41,7 @@ from npa_envs.agents.learning.progress import Progress
 from npa_envs.agents.learning.rule_set import RuleSet
 from npa_envs.agents.learning.species_env import ConcatenatedSpeciesEnv
 from npa_envs.checks import check_flag, check_positive, check_word
+from npa_envs.envs.core.step_report import PARTICLE_REWARDS
 from npa_envs.envs.core.world_state import free_bytes, needed_bytes
 from npa_envs.errors import NPAError
 from npa_envs.training.process_group import (
@@ -76,7 +76,7 @@ class PPOOptions(CommonOptions):
     ratio: Literal["particle", "world"] = "particle"
     """One likelihood ratio for each particle, or one for each world: of the mean log-probability
     of its particles."""
-    particle_rewards: ParticleRewardKind | None = None
+    particle_rewards: str | None = None
     """Reward of each particle: "particle", its own part of its world's reward; "marginal", the
     difference that its action makes to the world's. None: its world's reward."""
     masked: bool = False
@@ -90,7 +90,7 @@ class PPOOptions(CommonOptions):
         if self.num_envs is not None:
             check_positive(self, int, "num_envs")
         check_word(self, "ratio", ("particle", "world"))
-        check_word(self, "particle_rewards", (None, *get_args(ParticleRewardKind)))
+        check_word(self, "particle_rewards", (None, *PARTICLE_REWARDS))
         if self.ratio == "world" and self.particle_rewards is not None:
             raise NPAError(
                 f"particle_rewards={self.particle_rewards!r} needs ratio='particle': with "

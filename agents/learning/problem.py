@@ -10,7 +10,7 @@ import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
-from typing import Any, Literal, NamedTuple, Self, get_args
+from typing import Any, NamedTuple, Self
 
 import gymnasium
 import torch
@@ -20,6 +20,7 @@ from npa_envs.agents.learning.rule_set import ClampedRule, RuleSet, species_of
 from npa_envs.agents.learning.species_env import ConcatenatedSpeciesEnv
 from npa_envs.checks import check_device, check_positive, is_whole
 from npa_envs.envs.core.config import EnvConfig, Interface
+from npa_envs.envs.core.step_report import PARTICLE_REWARDS
 from npa_envs.envs.core.task import Controls, EnvTask
 from npa_envs.envs.core.vector import NPAVectorEnv
 from npa_envs.envs.multi.shipped_tasks import task_settings
@@ -55,9 +56,6 @@ KEY_RANGE = -(2**63), 2**63 - 1
 
 SPECIES_IDS = (*SPECIES_TASKS, *(size.id for size in SPECIES_SIZES))
 """Ids of environments of several species."""
-
-ParticleRewardKind = Literal["particle", "marginal"]
-"""Kinds of rewards that each particle gets separately."""
 
 RESERVED_KEYWORDS = {
     "num_envs": "set the field num_envs of Problem",
@@ -98,7 +96,7 @@ class Problem:
         for name in self.keywords:
             if name in RESERVED_KEYWORDS:
                 raise NPAError(f"keywords must not have {shown(name)}: {RESERVED_KEYWORDS[name]}")
-        if (reward := self.keywords.get("reward")) in get_args(ParticleRewardKind):
+        if (reward := self.keywords.get("reward")) in PARTICLE_REWARDS:
             raise NPAError(
                 f"keywords must not have reward={reward!r}: ask make_envs for "
                 f"particle_rewards={reward!r}"
@@ -172,7 +170,7 @@ class Problem:
         num_envs: int | None = None,
         *,
         device: str | torch.device = "cpu",
-        particle_rewards: ParticleRewardKind | None = None,
+        particle_rewards: str | None = None,
         tell_updated: bool = False,
         copy: bool = True,
     ) -> NPAVectorEnv | ConcatenatedSpeciesEnv:

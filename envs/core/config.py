@@ -21,11 +21,11 @@ from npa_envs.checks import (
     check_word,
     is_real,
 )
+from npa_envs.envs.core.step_report import PARTICLE_REWARDS, REWARDS
 from npa_envs.errors import NPAError, UnknownKeywordError, shown, suggest
 from npa_envs.render import STYLES
 from npa_envs.world.environment_steps import Boundary, Limits, Physics, Terms
 
-Reward = Literal["dense", "sparse", "particle", "marginal"]
 Output = Literal["numpy", "torch"]
 OnDivergence = Literal["terminate", "reset", "raise", "ignore"]
 
@@ -281,7 +281,7 @@ class EnvConfig(WorldConfig):
     """Configuration fields of all environments of one species; each task adds its own."""
 
     choices = WorldConfig.choices | {
-        "reward": get_args(Reward),
+        "reward": tuple(REWARDS),
         "on_divergence": get_args(OnDivergence),
         "render_style": STYLES,
     }
@@ -299,10 +299,9 @@ class EnvConfig(WorldConfig):
     particles within the episode; "raise" raises an error that names the particle; "ignore"
     continues with values clipped to the limits. `info["diverged"]` is True in each case."""
 
-    reward: Reward = "dense"
-    """"dense": each step's improvement of the loss; "sparse": minus the loss at the episode's end;
-    "particle" and "marginal": as dense, with each particle's reward in `info["particle_reward"]`:
-    the decrease of its own loss, or what its action contributed to the decrease of the world's."""
+    reward: str = "dense"
+    """What is rewarded, and when: "dense", "sparse", "particle" or "marginal", as in the section
+    Reward."""
 
     tell_updated: bool = False
     """Report in `info["updated"]` which particles the step updated. The others ignored their
@@ -348,7 +347,7 @@ class EnvConfig(WorldConfig):
     @property
     def per_particle_reward(self) -> bool:
         """Whether `info` has a reward for each particle."""
-        return self.reward not in ("dense", "sparse")
+        return self.reward in PARTICLE_REWARDS
 
 
 def check_picture_size(config: Any) -> None:

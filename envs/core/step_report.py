@@ -5,12 +5,12 @@ from __future__ import annotations
 import contextlib
 import functools
 from collections.abc import Callable, Iterator
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
 from torch import Tensor
 
-from npa_envs.envs.core.task import EnvTask, checked_tensor
+from npa_envs.checks import checked_tensor
 from npa_envs.world.cuda_graph import makes_plain_tensors, pinned_like
 from npa_envs.world.environment_steps import (
     DIVERGED,
@@ -22,8 +22,14 @@ from npa_envs.world.environment_steps import (
 )
 from npa_envs.world.particles import Particles
 
+if TYPE_CHECKING:
+    from npa_envs.envs.core.task import EnvTask
+
 FLAG_ROWS = 2
 """Rows of a report's buffer, float32, whose bytes are the eight rows of `StepReport.flags`."""
+
+TRUE_ROW = 4
+"""Row of `StepReport.flags` that is always True."""
 
 
 def total(terms: Tensor) -> Tensor:
@@ -76,7 +82,7 @@ class StepReport(NamedTuple):
         """Return a `StepReport` of zeros for B worlds; their loss has `term_count` terms."""
         rows = 2 + 2 * term_count + FLAG_ROWS
         report = cls.from_buffer(torch.zeros(rows, world_count, device=device, dtype=torch.float32))
-        report.flags[4].fill_(True)
+        report.flags[TRUE_ROW].fill_(True)
         return report
 
     @classmethod
@@ -86,9 +92,9 @@ class StepReport(NamedTuple):
         return cls(buffer, buffer[:-FLAG_ROWS], flags)
 
     @property
-    def endings(self) -> Tensor:
+    def end_flags(self) -> Tensor:
         """Terminated, truncated, success, diverged, bool, shape [4, B]."""
-        return self.flags[:4]
+        return self.flags[:TRUE_ROW]
 
     @property
     def named(self) -> StepNumbers:
@@ -118,7 +124,7 @@ class WorldEpisodes:
         self._start_loss = torch.zeros_like(diverged, dtype=torch.float32)
         self._success_loss = torch.zeros_like(self._start_loss)
         # Each world's ending, then `enabled`.
-        self._endings = diverged.new_zeros(len(diverged) + 1)
+        self._ending_bits = diverged.new_zeros(len(diverged) + 1)
         self.term_names: tuple[str, ...] = ()
         """Names of the terms of the loss, known once worlds have been placed."""
         self.report = StepReport.empty(len(diverged), 0, diverged.device)
@@ -126,7 +132,7 @@ class WorldEpisodes:
         self._attach()
 
     def __getstate__(self) -> dict[str, Any]:
-        return self.__dict__ | dict.fromkeys(("update", "host_endings", "host_numbers"))
+        return self.__dict__ | dict.fromkeys(("update", "host_ending_bits", "host_numbers"))
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state)
@@ -135,9 +141,9 @@ class WorldEpisodes:
     @makes_plain_tensors
     def _attach(self) -> None:
         """Make `update` and the host's copies for the tensors of the current `report`."""
-        read = (self._endings, self.report.numbers)
-        self.host_endings, self.host_numbers = (
-            map(pinned_like, read) if self._endings.is_cuda else read
+        read = (self._ending_bits, self.report.numbers)
+        self.host_ending_bits, self.host_numbers = (
+            map(pinned_like, read) if self._ending_bits.is_cuda else read
         )
         self.update = EpisodeUpdate(
             self._rules,
@@ -147,8 +153,8 @@ class WorldEpisodes:
             success_loss=self._success_loss,
             elapsed=self.elapsed,
             numbers=self.report.numbers,
-            flags=self.report.endings,
-            endings=self._endings,
+            flags=self.report.end_flags,
+            ending_bits=self._ending_bits,
         )
 
     def put_losses(self, world_indices: Tensor, names: tuple[str, ...], terms: Tensor) -> None:
@@ -160,7 +166,7 @@ class WorldEpisodes:
         zeros = torch.zeros_like(terms)
         numbers = torch.cat((zeros[:1], total(terms)[None], terms, zeros))
         self.report.numbers.index_copy_(1, world_indices, numbers)
-        self.report.endings.index_fill_(1, world_indices, False)
+        self.report.end_flags.index_fill_(1, world_indices, False)
 
     def begin(self, world_indices: Tensor, success_loss: Tensor | None) -> None:
         """Begin episodes of worlds, int64 [B'], to succeed at `success_loss`, [B']; None: never."""
@@ -180,15 +186,15 @@ class WorldEpisodes:
         now, earlier = self.report.named, before.named
         now.reward[world_indices] = earlier.reward[world_indices]
         now.improvements[:, world_indices] = earlier.improvements[:, world_indices]
-        self.report.endings.copy_(before.endings)
+        self.report.end_flags.copy_(before.end_flags)
         if len(self.elapsed) == 1:
             # The host reads the numbers of a single world only; this synchronises.
             self.host_numbers.copy_(self.report.numbers)
 
     def copy_to_host(self) -> None:
         """Begin to copy endings, and the numbers of a single world, to the host."""
-        if self._endings.is_cuda:
-            self.host_endings.copy_(self._endings, non_blocking=True)
+        if self._ending_bits.is_cuda:
+            self.host_ending_bits.copy_(self._ending_bits, non_blocking=True)
             if len(self.elapsed) == 1:
                 self.host_numbers.copy_(self.report.numbers, non_blocking=True)
 
@@ -270,8 +276,23 @@ class MarginalGains(ParticleRewards):
         super().write(gains + missed[:, None], reward, by_world, enabled)
 
 
-PARTICLE_REWARDS: dict[str, type[ParticleRewards]] = {
-    "particle": LossDecreases,
-    "marginal": MarginalGains,
+class RewardKind(NamedTuple):
+    """What a value of `reward=` rewards, and when."""
+
+    last_step_only: bool
+    """Whether worlds are rewarded in the last step of an episode alone, with minus their loss; else
+    in each step, with the decrease of it."""
+    particle_rewards: type[ParticleRewards] | None
+    """What computes rewards of single particles; None: only worlds are rewarded."""
+
+
+REWARDS = {
+    "dense": RewardKind(last_step_only=False, particle_rewards=None),
+    "sparse": RewardKind(last_step_only=True, particle_rewards=None),
+    "particle": RewardKind(last_step_only=False, particle_rewards=LossDecreases),
+    "marginal": RewardKind(last_step_only=False, particle_rewards=MarginalGains),
 }
-"""How single particles are rewarded, by `reward=`; "dense" and "sparse" reward only worlds."""
+"""Values of `reward=` in environments of one species; the docstring of `NPAEnv` explains each."""
+
+PARTICLE_REWARDS = tuple(word for word, kind in REWARDS.items() if kind.particle_rewards)
+"""Values of `reward=` that reward single particles."""

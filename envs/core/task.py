@@ -1,10 +1,11 @@
-"""Tasks of environments: where worlds start, their losses, and checks of what tasks return."""
+"""Base classes of tasks: start worlds and losses of environments, with checks of both."""
 
 from __future__ import annotations
 
+import contextlib
 import copy
 import random
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Any, ClassVar, Generic, Literal, NamedTuple, Self, TypeVar
 
 import numpy as np
@@ -12,7 +13,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from npa_envs.checks import checked_tensor
 from npa_envs.envs.core.config import EnvConfig, WorldConfig
+from npa_envs.envs.core.step_report import REWARDS
 from npa_envs.errors import NPAError, shown
 from npa_envs.render import draw_worlds
 from npa_envs.world.cuda_graph import capture_lock
@@ -228,7 +231,7 @@ class EnvTask(WorldTask[Config]):
     @property
     def rewards_last_step_only(self) -> bool:
         """Whether only the last step of an episode is rewarded."""
-        return self.config.reward == "sparse"
+        return REWARDS[self.config.reward].last_step_only
 
     def start(self, random: WorldRandom) -> Start:
         """Return the worlds of B episodes: new ones of `fresh`, or random ones of the pool."""
@@ -384,28 +387,6 @@ def checked_losses(
     ]
 
 
-def checked_tensor(
-    task: EnvTask[Any],
-    method: str,
-    field: str,
-    value: Any,
-    shape: tuple[int, ...],
-    dtype: torch.dtype = torch.float32,
-) -> Tensor:
-    """Return `value`, which `method` returned as `field`, if it has this shape and type."""
-    device = task.device
-    if not isinstance(value, Tensor):
-        actual = f"a {type(value).__name__}"
-    elif tuple(value.shape) != shape or value.dtype != dtype or value.device.type != device.type:
-        actual = f"{value.dtype} of shape {tuple(value.shape)} on {value.device}"
-    else:
-        return value
-    raise NPAError(
-        f"{field} of {type(task).__name__}.{method} must be a {dtype} tensor of shape {shape} on "
-        f"{device}, got {actual}: reshape or convert it there"
-    )
-
-
 def check_finite(task: EnvTask[Any], method: str, values: Mapping[str, Tensor]) -> None:
     """Check that tensors, [B, ...], by their names in the error, are finite; synchronises."""
     for field, value in values.items():
@@ -434,8 +415,11 @@ def global_rng_states(device: torch.device) -> dict[str, Any]:
     return states
 
 
-def check_no_draws(task: EnvTask[Any], method: str, before: dict[str, Any]) -> None:
-    """Check that `method` drew from no global generator: states are still those `before`."""
+@contextlib.contextmanager
+def no_global_draws(task: EnvTask[Any], method: str) -> Iterator[None]:
+    """Check that `method`, called in the `with` block, draws from no global generator."""
+    before = global_rng_states(task.device)
+    yield
     now = global_rng_states(task.device)
     moved = [name for name, state in before.items() if state != now[name]]
     if moved:

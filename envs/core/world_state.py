@@ -130,7 +130,7 @@ class WorldState:
         return random
 
     def checked_particles(self, x: Any, s: Any, world_count: int, particle_count: int) -> Particles:
-        """Return `x` and `s`, [B', N', ...], after a check, as float32 on the device."""
+        """Return `x` and `s`, float32, on the device; their shape and limits are checked."""
         checked, physics = [], self.physics
         for name, value, width, limit, limit_name in (
             ("x", x, physics.space_dim, physics.limits.position, "position_limit"),

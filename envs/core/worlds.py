@@ -14,15 +14,14 @@ from torch import Tensor
 
 from npa_envs.envs.core.config import EnvConfig
 from npa_envs.envs.core.graphed_steps import GraphedStarts, GraphedSteps
-from npa_envs.envs.core.step_report import PARTICLE_REWARDS, ParticleRewards, WorldEpisodes
+from npa_envs.envs.core.step_report import REWARDS, ParticleRewards, WorldEpisodes
 from npa_envs.envs.core.task import (
     EnvTask,
     Start,
     check_finite,
-    check_no_draws,
     check_start,
     checked_losses,
-    global_rng_states,
+    no_global_draws,
     start_method,
 )
 from npa_envs.envs.core.world_state import WorldState, check_default_dtype, not_finite
@@ -36,13 +35,22 @@ from npa_envs.world.environment_steps import (
     NeighbourState,
 )
 from npa_envs.world.particles import Particles
+from npa_envs.world.randomness import WorldRandom
 
 
 class BatchedWorlds(WorldState):
     """Base class: B worlds of one task, with their steps, losses, rewards and episode ends.
 
     Subclasses define what actions do (`queue`) and what is observed (`perceive`). All tensors keep
-    their memory between steps, as CUDA graphs need.
+    their memory between steps, as CUDA graphs need. Methods that replace particles of some worlds:
+
+    | Method | Called by | Does |
+    |---|---|---|
+    | `restart` | `step` of vectors, `reseed` | `start`, then observes these worlds |
+    | `reseed` | `handle_diverged` | `restart`, but the episodes continue |
+    | `start` | `reset` of environments, `restart` | draws and checks a `Start`, then `begin` |
+    | `begin` | `start` | `place`, then a new episode |
+    | `place` | `place_particles`, `begin` | replaces particles, goals and losses |
     """
 
     @makes_plain_tensors
@@ -82,10 +90,9 @@ class BatchedWorlds(WorldState):
         rewarded_step = self.episode_steps if rewards_last else None
         rules = EpisodeRules(self.episode_steps, rewarded_step, config.on_divergence)
         self.episodes = WorldEpisodes(rules, self.enabled, self.diverged)
-        self.particle_rewards: ParticleRewards | None = None
+        kind = REWARDS[config.reward].particle_rewards
+        self.particle_rewards: ParticleRewards | None = kind and kind(self.particles)
         """Rewards of single particles, where they have any."""
-        if config.per_particle_reward:
-            self.particle_rewards = PARTICLE_REWARDS[config.reward](self.particles)
 
     @torch.no_grad()
     @makes_plain_tensors
@@ -93,20 +100,29 @@ class BatchedWorlds(WorldState):
         """Start episodes in worlds, int64 [B'], and return these; `keys`: as in `next_streams`."""
         random = self.next_streams(world_indices, keys)
         check_default_dtype()
-        # The first start is not captured as a graph, so that it can synchronise for checks.
-        task, first = self.task, not self.episodes.term_names
-        draws = global_rng_states(self.device) if first else {}
-        check = first or not self.x.is_cuda
-        start = task.start(random)
-        check_start(task, start, len(world_indices), (self.x.shape, self.s.shape))
-        if first:
-            check_no_draws(task, start_method(task), draws)
+        if not self.episodes.term_names:
+            return self._first_start(world_indices, random)
+        # On CUDA a start may be captured as a graph, so that checks must not synchronise.
+        return self._begun(world_indices, random, self._made(random), check=not self.x.is_cuda)
+
+    def _first_start(self, world_indices: Tensor, random: WorldRandom) -> Start:
+        """Start the first episodes, and check that the task draws from no global generator."""
+        with no_global_draws(self.task, start_method(self.task)):
+            start = self._made(random)
+        with no_global_draws(self.task, "losses"):
+            return self._begun(world_indices, random, start, check=True)
+
+    def _made(self, random: WorldRandom) -> Start:
+        start = self.task.start(random)
+        check_start(self.task, start, random.world_count, (self.x.shape, self.s.shape))
+        return start
+
+    def _begun(self, indices: Tensor, random: WorldRandom, start: Start, *, check: bool) -> Start:
         if check:
-            check_finite(task, start_method(task), {"positions": start.x, "states": start.s})
-        self.random.put(world_indices, random)
-        self.begin(world_indices, start, check=check)
-        if first:
-            check_no_draws(task, "losses", draws)
+            name = start_method(self.task)
+            check_finite(self.task, name, {"positions": start.x, "states": start.s})
+        self.random.put(indices, random)
+        self.begin(indices, start, check=check)
         return start
 
     def begin(self, world_indices: Tensor, start: Start, *, check: bool) -> None:
@@ -155,9 +171,9 @@ class BatchedWorlds(WorldState):
             rewards.reward.copy_(before)
 
     def step(self, action: Tensor, out: Tensor | None = None) -> tuple[NDArray[np.uint8], Tensor]:
-        """Apply actions; return endings, [B], and observations, [B, ...], in `out` if it is given.
+        """Apply actions; return ending bits, [B], and observations, [B, ...], in `out` if given.
 
-        An ending has bits such as `SUCCESS`, and is 0 if the episode continues.
+        Bits are `SUCCESS`, `DIVERGED` and `TIME_LIMIT`; 0: the episode continues.
 
         Raises:
             DivergedError: An action is not finite; worlds and report are not changed.
@@ -166,19 +182,19 @@ class BatchedWorlds(WorldState):
         observation = self.queue(action, out)
         if self.side_stream is not None:
             self.side_stream.wait()
-        read: NDArray[np.uint8] = self.episodes.host_endings.numpy()
+        read: NDArray[np.uint8] = self.episodes.host_ending_bits.numpy()
         if not read[-1]:
             # The step was not made: the next one draws its random numbers again.
-            self.random.steps -= 1
+            self.random.undo_advance()
             raise not_finite(action)
-        endings = read[:-1].copy()
-        if (endings & NOT_FINITE).any():
+        ending_bits = read[:-1].copy()
+        if (ending_bits & NOT_FINITE).any():
             self.check_losses(torch.arange(self.world_count, device=self.device))
             raise NPAError(
                 f"losses of {type(self.task).__name__} must be finite before and after a step: "
                 "correct them, then reset"
             )
-        return endings, observation
+        return ending_bits, observation
 
     def queue(self, action: Tensor, out: Tensor | None = None) -> Tensor:
         """Step the worlds, mark `side_stream`; return observations, [B, ...], in `out` if given."""
@@ -231,20 +247,20 @@ class BatchedWorlds(WorldState):
         """Return values of particles for infos of steps, by name, [B, N] each."""
         return {}
 
-    def handle_diverged(self, endings: NDArray[np.uint8], observation: Tensor) -> NDArray[np.uint8]:
-        """Apply `on_divergence` to worlds that diverged; return the endings, [B], after that."""
+    def handle_diverged(self, bits: NDArray[np.uint8], observation: Tensor) -> NDArray[np.uint8]:
+        """Apply `on_divergence` to worlds that diverged; return their ending bits, [B]."""
         on_divergence = self.task.config.on_divergence
-        diverged = endings & DIVERGED != 0
+        diverged = bits & DIVERGED != 0
         if on_divergence == "terminate" or not diverged.any():
-            return endings
+            return bits
         if on_divergence == "raise":
             raise self.divergence_error(np.flatnonzero(diverged), self.episodes.elapsed)
         if on_divergence == "reset":
             # Worlds that are also truncated start their next episode anyway.
-            only_diverged = np.flatnonzero(endings == DIVERGED)
+            only_diverged = np.flatnonzero(bits == DIVERGED)
             if len(only_diverged):
                 self.reseed(only_diverged, observation)
-        return endings & ~np.uint8(DIVERGED)
+        return bits & ~np.uint8(DIVERGED)
 
     def pictures(self, count: int) -> NDArray[np.uint8]:
         """Return pictures of the first worlds, uint8, shape [count, R, R, 3]."""

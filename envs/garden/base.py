@@ -12,7 +12,7 @@ from torch import Tensor
 from npa_envs import world_mean
 from npa_envs.envs.core.single import NPAEnv
 from npa_envs.envs.core.task import Start
-from npa_envs.envs.garden.brushes import (
+from npa_envs.envs.garden.brush_actions import (
     OBSERVATION_LIMIT,
     VALUES_PER_PLACE,
     BrushSpaces,
@@ -39,7 +39,7 @@ Config = TypeVar("Config", bound=GardenConfig)
 
 
 class TargetDeficit:
-    """What worlds lack at each place: sums over the target minus sums over their particles."""
+    """Sums over the target minus the same sums over a world's particles, at each place."""
 
     def __init__(self, places: Tensor, target: PointTarget, config: GardenConfig) -> None:
         self.places, self._config = places, config
@@ -146,7 +146,7 @@ class GardenTask(RuleDrivenTask[Config], GrownTask[Config]):
         return StartLosses(loss, (grey - loss).maximum(MIN_GREY_RISE * loss))
 
     def lost_fraction(self, loss: Tensor, context: Any) -> Tensor:
-        """Return lost fractions, [B]: 0 for the loss at the start, 1 for that of a grey picture."""
+        """Return lost fractions of pictures, [B]: 0 as good as at the start, 1 as bad as grey."""
         fraction: Tensor = (loss - context.intact_loss) / context.rise
         return fraction
 
@@ -165,7 +165,7 @@ class GardenTask(RuleDrivenTask[Config], GrownTask[Config]):
         return observed.clamp(-OBSERVATION_LIMIT, OBSERVATION_LIMIT)
 
     def observed_picture(self, particles: Particles) -> Tensor:
-        """Return pictures, [B, R, R, 4]; `observe_error` adds the target minus them."""
+        """Return pictures, [B, R, R, 4], or with `observe_error` also target minus it, [.., 8]."""
         picture = self.task.picture(particles.x, particles.s)
         if not self.config.observe_error:
             return picture

@@ -194,7 +194,7 @@ class CoMorphogenesisTask(PictureLossTask):
 
 @dataclass(frozen=True, kw_only=True)
 class InvasionConfig(OnePictureConfig):
-    """`OnePictureConfig` with what acts for invaders: all species except species 0."""
+    """`OnePictureConfig`, and who acts for the invaders, which are all species but species 0."""
 
     choices = OnePictureConfig.choices | {"opponent": (None, "random")}
     fixed = OnePictureConfig.fixed | {"reward": "in invasion, where the sum of all rewards is zero"}

@@ -49,7 +49,7 @@ class EpisodeUpdate:
         numbers: Reward; loss; its L terms; their decreases; float32, shape [2 + 2 L, B]. Losses
             and terms of the step before are read; all become those of this step.
         flags: Terminated; truncated; success; diverged; bool, shape [4, B]; written.
-        endings: Bits of each world, such as `SUCCESS`, then `enabled`, uint8, shape [B + 1];
+        ending_bits: Bits of each world, such as `SUCCESS`, then `enabled`, uint8, shape [B + 1];
             written.
     """
 
@@ -64,12 +64,12 @@ class EpisodeUpdate:
         elapsed: Tensor,
         numbers: Tensor,
         flags: Tensor,
-        endings: Tensor,
+        ending_bits: Tensor,
     ) -> None:
         on_divergence = ON_DIVERGENCE[rules.on_divergence]
         self._rules = (rules.last_step or 0, rules.rewarded_step or 0, on_divergence)
         self._read = (enabled, diverged, first_loss, success_loss)
-        self._written = (elapsed, numbers, flags.view(torch.uint8), endings)
+        self._written = (elapsed, numbers, flags.view(torch.uint8), ending_bits)
         self._world_count = len(elapsed)
 
     def __call__(self, loss_terms: Tensor, broken: Tensor | None = None) -> None:

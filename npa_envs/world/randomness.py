@@ -128,6 +128,10 @@ class WorldRandom:
         self.steps += checked_count("steps", steps)
         self._draw_count = 0
 
+    def undo_advance(self) -> None:
+        """Go back by one step, whose random numbers the next `advance` repeats."""
+        self.steps -= 1
+
     def restart(self) -> None:
         """Begin the next episode of every world at step 0, in place, with new random numbers."""
         self.episodes += 1
@@ -162,9 +166,8 @@ class WorldRandom:
     def put(self, worlds: Tensor | slice, other: WorldRandom) -> None:
         """Write the keys, episodes and steps of other streams into some worlds, in place.
 
-        `worlds` are indices, int64, 1D, or a slice. From the next `advance` on, these worlds draw
-        the numbers of the other streams. Until then they draw others, but none twice, as all worlds
-        share the count of calls in a step.
+        `worlds` are indices, int64, 1D, or a slice. From the next `advance` on they draw the other
+        streams' numbers. Until then they draw no number twice: worlds share the count of calls.
         """
         self.keys[worlds] = other.keys
         self.episodes[worlds] = other.episodes
@@ -234,11 +237,9 @@ class WorldRandom:
                 f"a draw must have at most {MAX_INDEX} numbers, got {count} for each of "
                 f"{self.world_count} worlds: draw several times"
             )
-        number = self._draw_count
+        index = self._draw_count
         self._draw_count += 1
-        drawn: Tensor = draw(
-            self.keys, self.episodes, self.steps, number, kind, count, dtype, bound
-        )
+        drawn: Tensor = draw(self.keys, self.episodes, self.steps, index, kind, count, dtype, bound)
         return drawn.view(self.world_count, *shape)
 
 

@@ -15,7 +15,7 @@ import npa_envs
 from npa_envs.agents.shapeshifter_policies import RecognisingShapeshifter
 from npa_envs.envs import gardeners_v0
 from npa_envs.envs.garden.base import StartLosses
-from npa_envs.envs.garden.brushes import BrushLayout, apply_brushes, grid_places
+from npa_envs.envs.garden.brush_actions import BrushLayout, apply_brushes, grid_places
 from npa_envs.envs.gardener2d import Gardener2DEnv
 from npa_envs.registration import GARDENS
 from npa_envs.world.particles import Particles

@@ -79,7 +79,7 @@ def test_rewards_and_endings_equal_those_by_torch(rules, happened, device):
     update = EpisodeUpdate(
         rules,
         enabled=torch.full((1,), happened, dtype=torch.uint8, device=device),
-        endings=endings,
+        ending_bits=endings,
         **{name: arguments[name] for name in arguments.keys() - {"parts", "broken"}},
     )
     update(arguments["parts"], arguments["broken"])

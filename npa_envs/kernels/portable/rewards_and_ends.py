@@ -32,7 +32,7 @@ def update_episodes(
     numbers: wp.array[wp.float32],
     flags: wp.array[wp.uint8],
     # outputs
-    endings: wp.array[wp.uint8],
+    ending_bits: wp.array[wp.uint8],
 ):
     """Write each world's reward, losses, flags and ending; if not enabled, only endings, all 0.
 
@@ -44,9 +44,9 @@ def update_episodes(
     count = elapsed.shape[0]
     is_enabled = enabled[0]
     if world == 0:
-        endings[count] = is_enabled
+        ending_bits[count] = is_enabled
     if is_enabled == wp.uint8(0):
-        endings[world] = wp.uint8(0)
+        ending_bits[world] = wp.uint8(0)
         return
     step = elapsed[world] + 1
     has_diverged = diverged[world] != wp.uint8(0)
@@ -90,4 +90,4 @@ def update_episodes(
     flags[count + world] = wp.uint8(truncated)
     flags[2 * count + world] = wp.uint8(success)
     flags[3 * count + world] = wp.uint8(has_diverged)
-    endings[world] = wp.uint8(ending)
+    ending_bits[world] = wp.uint8(ending)

@@ -1,4 +1,4 @@
-"""Brushes of agents on rule-driven worlds: configuration, effects, and spaces."""
+"""Actions by brushes in gardens: configuration, columns, effects on particles, and spaces."""
 
 from __future__ import annotations
 
@@ -244,7 +244,7 @@ class BrushSpaces(ParticleSpaces):
             self.action_space = MultiDiscrete(self._choices * config.brush_count)
 
     def action(self, action: Any, world_count: int | None) -> Tensor:
-        """Return checked actions as a row for each brush, float32, shape [B, J, W]."""
+        """Return checked actions float32, [B, J, W]: W columns for each of J brushes."""
         if self._config.actions != "discrete":
             return batch_tensor(action, world_count, self.rows_shape, "J, W")
         brushes = self._config.brush_count
