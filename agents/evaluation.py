@@ -52,7 +52,7 @@ class Episodes(NamedTuple):
 def evaluate_policy(env: Any, policy: Callable[[Any], Any], seeds: Iterable[int]) -> Episodes:
     """Run one episode from each seed, as many at a time as the environment has worlds.
 
-    Each is the first one after a reset with its seed: results do not depend on other episodes.
+    Each is the first one after a reset with its seed. Results do not depend on other episodes.
 
     Args:
         env: A single or a vector environment of `npa_envs`, or Gymnasium's `SyncVectorEnv` or

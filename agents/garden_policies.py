@@ -51,7 +51,7 @@ class BrushPolicy:
         return actions if isinstance(array, Tensor) else actions.cpu().numpy()
 
     def act(self) -> Tensor:
-        """Return actions for the environment's B worlds as they are now, float32, [B, J, W]."""
+        """Return actions for the worlds as they are now, float32 [B, J brushes, W columns]."""
         raise NotImplementedError
 
     def still(self) -> Tensor:
@@ -83,7 +83,7 @@ class RandomGardener(BrushPolicy):
 class ScriptedGardener(BrushPolicy):
     """Push particles to places with a deficit, where their density is less than the target's.
 
-    A grid pushes everywhere. Free brushes go in turn to the longest push that has no brush yet.
+    Brushes on a grid all push. Each free brush goes to the free place that needs the longest push.
 
     Args:
         gain: Factor on the deficit's gradient, which a brush pushes along (dimensionless).

@@ -203,7 +203,7 @@ def final_picture(
 
 
 def main(folder: Path) -> None:
-    """Load the libraries that the run in `folder` needs; do each run that standard input orders."""
+    """Import what the run in `folder` needs; do the run that each line of standard input orders."""
     orders: SimpleQueue[tuple[str, str, str]] = SimpleQueue()
 
     def listen() -> None:

@@ -50,7 +50,7 @@ CriticInput = Literal["particle", "central"]
 
 @dataclass(frozen=True, kw_only=True)
 class CommonOptions:
-    """Options of both PPOs: `ppo.py` and Stable-Baselines3's. None is a default of `SCHEDULES`."""
+    """Options of both PPOs: `ppo.py` and Stable-Baselines3's. `SCHEDULES` says what None is."""
 
     steps: int = 16
     """Steps of all worlds in a round, T."""

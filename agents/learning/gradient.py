@@ -27,7 +27,7 @@ class GradientOptions:
     """Options of gradient descent; `TrainConfig`, which most are passed to, checks them."""
 
     steps: tuple[int, int] | None = None
-    """Range [lo, hi) of a rollout's steps; None: whole episodes, or 32 to 96 of over 96 steps."""
+    """Range [lo, hi) of a rollout's steps; None: whole episodes, or 32 to 96 steps of long ones."""
     num_envs: int = 8
     """Worlds of a batch, B."""
     pool_size: int | None = None

@@ -353,7 +353,7 @@ class PPOLearner:
     def compute_gradients(
         self, minibatch: int, weight_sums: Tensor, *fields: Tensor
     ) -> tuple[Tensor]:
-        """Write critic's and rules' `grad` for a minibatch of a round, whose `fields` are given.
+        """Write the gradients of critic and rules for a minibatch of the round of these `fields`.
 
         Return the sums of the minibatch's KL estimates [nats] and of their weights, shape [2].
         """
@@ -404,7 +404,7 @@ class PPOLearner:
         return objective, kl_sums
 
     def descend_both(self, kl_sums: Tensor, rules_rate: Tensor, within_kl: Tensor) -> tuple[Tensor]:
-        """Step critic and rules; update and return `within_kl`, at 0 of which the rules stay."""
+        """Step the critic, and rules while `within_kl` is 1; update `within_kl` and return it."""
         self._descend(self.optimisers["critic"])
         # Rules that moved too far get the learning rate 0, without a synchronisation.
         divergence, count = kl_sums
