@@ -17,7 +17,7 @@ from npa_envs.errors import NPAError, shown
 from npa_envs.world.randomness import WorldRandom
 
 TIME_LIMIT = "time limit"
-"""Ending of an episode that was truncated."""
+"""End reason of an episode that was truncated."""
 
 _REASONS = {"reason", "diverged", "success"}
 
@@ -34,8 +34,8 @@ class Episodes(NamedTuple):
     steps: NDArray[np.int64]
     """Number of steps."""
     endings: tuple[str, ...]
-    """Why the episode ended: "success", "diverged" or "time limit"; with several species the reason
-    of the first one that terminated, or "left the world" if one diverged."""
+    """End reasons: "success", "diverged" or "time limit"; with several species the reason of the
+    first one that terminated, or "left the world" if one diverged."""
 
     @property
     def mean_return(self) -> float:
@@ -52,8 +52,7 @@ class Episodes(NamedTuple):
 def evaluate_policy(env: Any, policy: Callable[[Any], Any], seeds: Iterable[int]) -> Episodes:
     """Run one episode from each seed, as many at a time as the environment has worlds.
 
-    Each is the first episode after a reset with its seed. So results depend neither on the number
-    of worlds nor on the lengths of other episodes.
+    Each is the first one after a reset with its seed. Results do not depend on other episodes.
 
     Args:
         env: A single or a vector environment of `npa_envs`, or Gymnasium's `SyncVectorEnv` or
@@ -84,10 +83,10 @@ def evaluate_policy(env: Any, policy: Callable[[Any], Any], seeds: Iterable[int]
     run, count = (_run_single, 1) if single else (_run_many, env.num_envs)
     batches = [seeds[k : k + count] for k in range(0, len(seeds), count)]
     results = [run(env, policy, [*batch, *batch[-1:] * (count - len(batch))]) for batch in batches]
-    returns, start_losses, final_losses, steps, endings = (
+    returns, start_losses, final_losses, steps, end_reasons = (
         np.concatenate(column)[: len(seeds)] for column in zip(*results, strict=True)
     )
-    return Episodes(returns, start_losses, final_losses, steps, tuple(endings.tolist()))
+    return Episodes(returns, start_losses, final_losses, steps, tuple(end_reasons.tolist()))
 
 
 def checked_seeds(name: str, seeds: Iterable[int]) -> list[int]:
@@ -105,7 +104,7 @@ def checked_seeds(name: str, seeds: Iterable[int]) -> list[int]:
 
 
 def bound_to(env: Any, policy: Callable[[Any], Any]) -> Callable[[Any], Any]:
-    """Return `policy.made_for(env)` if the policy has that, as it reads worlds; else the policy."""
+    """Return `policy.made_for(env)`, which policies that read worlds have; else `policy` itself."""
     make = getattr(policy, "made_for", None)
     return policy if make is None else make(env)
 
@@ -121,7 +120,7 @@ def _run_many(env: Any, policy: Callable[[Any], Any], seeds: list[int]) -> tuple
     start_losses = _as_numpy(infos["loss"])
     returns, final_losses = np.zeros(len(seeds)), np.zeros(len(seeds))
     steps = np.zeros(len(seeds), dtype=np.int64)
-    endings = np.full(len(seeds), None, dtype=object)
+    end_reasons = np.full(len(seeds), None, dtype=object)
     running = np.ones(len(seeds), dtype=bool)
     resets_itself = env.metadata.get("autoreset_mode") is not AutoresetMode.DISABLED
     while running.any():
@@ -135,11 +134,11 @@ def _run_many(env: Any, policy: Callable[[Any], Any], seeds: list[int]) -> tuple
             final_losses[over] = _as_numpy(final["loss"])[over]
             for k in np.flatnonzero(over):
                 info = {name: final[name][k] for name in _REASONS & final.keys()}
-                endings[k] = _ending(info, bool(terminated[k]))
+                end_reasons[k] = _end_reason(info, bool(terminated[k]))
             running &= ~over
         if not resets_itself and ended.any() and running.any():
             observation, _ = env.reset(options={"reset_mask": ended})
-    return returns, start_losses, final_losses, steps, endings
+    return returns, start_losses, final_losses, steps, end_reasons
 
 
 def _run_single(
@@ -157,11 +156,11 @@ def _run_single(
         action = policy(batch)[0]
         observation, reward, terminated, truncated, info = env.step(action)
         total, steps, over = total + float(reward), steps + 1, terminated or truncated
-    ending = np.array([_ending(info, terminated)], dtype=object)
-    return *(np.array([n]) for n in (total, start_loss, info["loss"], steps)), ending
+    end_reason = np.array([_end_reason(info, terminated)], dtype=object)
+    return *(np.array([n]) for n in (total, start_loss, info["loss"], steps)), end_reason
 
 
-def _ending(info: Mapping[str, Any], terminated: bool) -> str:
+def _end_reason(info: Mapping[str, Any], terminated: bool) -> str:
     flags = [name for name in ("diverged", "success") if terminated and info.get(name)]
     return str(info.get("reason") or next(iter(flags), TIME_LIMIT))
 

@@ -41,9 +41,9 @@ class BrushPolicy:
         """Shape of a world's actions, (J, W)."""
 
     def __call__(self, observation: Any) -> Any:
-        """Return actions, [J, W] for the observation [O] of one world, [B, J, W] for [B, O].
+        """Return actions, [J, W] for one world's observation of shape [O], [B, J, W] for [B, O].
 
-        They are arrays for arrays, tensors for tensors. The observation's numbers are not read.
+        J brushes have W columns each. Of the observation only the form counts: worlds are read.
         """
         array = observation["observation"] if isinstance(observation, dict) else observation
         one_world = array.ndim == 1
@@ -83,8 +83,7 @@ class RandomGardener(BrushPolicy):
 class ScriptedGardener(BrushPolicy):
     """Push particles to places with a deficit, where their density is less than the target's.
 
-    Brushes on a grid push at all places at once. Free brushes go one by one to the place that needs
-    the longest push and has no brush yet.
+    Brushes on a grid all push. Each free brush goes to the free place that needs the longest push.
 
     Args:
         gain: Factor on the deficit's gradient, which a brush pushes along (dimensionless).

@@ -76,8 +76,7 @@ class Policy:
     It maps observations of one world, [N, P], or of several, [B, N, P], to actions [N, A] or
     [B, N, A], float32, within the action space: arrays to arrays, and tensors to tensors on the
     same device. It also maps a dict of agents' observations, as of PettingZoo's parallel
-    environments, to a dict of their actions. No gradients flow through it. `interface` is that of
-    its environment, `interface_of(env)`.
+    environments, to a dict of their actions. It has no gradients. `interface`: `interface_of(env)`.
     """
 
     def __init__(self, interface: Interface) -> None:
@@ -108,28 +107,14 @@ class Policy:
         """Return actions by agent, for observations [P], [N_k, P] or [B, N_k, P] of agent k."""
         if not observations:
             return {}
-        rows = {agent: torch.as_tensor(values) for agent, values in observations.items()}
-        rows = {agent: row if row.ndim > 1 else row[None] for agent, row in rows.items()}
+        rows = {agent: _as_rows(values) for agent, values in observations.items()}
         spans = self._spans({agent: values.shape[-2] for agent, values in rows.items()})
-        first = next(iter(rows.values()))
-        count = max(span.stop for span in spans.values())
-        joined = first.new_zeros(*first.shape[:-2], count, first.shape[-1])
-        for agent, span in spans.items():
-            target = joined[..., span, :]
-            if rows[agent].shape != target.shape:
-                raise NPAError(
-                    f"observation[{agent!r}] must have shape {tuple(target.shape)}, got "
-                    f"{tuple(rows[agent].shape)}: use the policy with the environment that it was "
-                    "made for"
-                )
-            target.copy_(rows[agent])
+        joined = _joined(rows, spans)
         actions = self._act_on(joined).to(joined.device)
-        result: dict[str, Any] = {}
-        for agent, observed in observations.items():
-            action = actions[..., spans[agent], :]
-            action = action if np.ndim(observed) > 1 else action[0]
-            result[agent] = action if isinstance(observed, Tensor) else action.cpu().numpy()
-        return result
+        return {
+            agent: _in_form_of(observed, actions[..., spans[agent], :])
+            for agent, observed in observations.items()
+        }
 
     def _spans(self, counts: Mapping[str, int]) -> dict[str, slice]:
         """Return the slice of each agent's particles, for the number of its particles."""
@@ -147,12 +132,38 @@ class Policy:
         return action.view(*shape[:-1], self.interface.action_dim)
 
 
+def _as_rows(observed: Any) -> Tensor:
+    """Return an agent's observations as a tensor, a row for each particle, [..., N_k, P]."""
+    rows = torch.as_tensor(observed)
+    return rows if rows.ndim > 1 else rows[None]
+
+
+def _joined(rows: Mapping[str, Tensor], spans: Mapping[str, slice]) -> Tensor:
+    """Return the rows of all agents in one tensor, [..., N, P]; other particles have zeros."""
+    first, count = next(iter(rows.values())), max(span.stop for span in spans.values())
+    joined = first.new_zeros(*first.shape[:-2], count, first.shape[-1])
+    for agent, span in spans.items():
+        target, shape = joined[..., span, :], tuple(rows[agent].shape)
+        if shape != target.shape:
+            raise NPAError(
+                f"observation[{agent!r}] must have shape {tuple(target.shape)}, got {shape}: use "
+                "the policy with the environment that it was made for"
+            )
+        target.copy_(rows[agent])
+    return joined
+
+
+def _in_form_of(observed: Any, action: Tensor) -> Any:
+    """Return an agent's actions as an array or a tensor, [A] or [..., N_k, A], as `observed`."""
+    action = action if np.ndim(observed) > 1 else action[0]
+    return action if isinstance(observed, Tensor) else action.cpu().numpy()
+
+
 class RulePolicy(Policy):
     """An update rule as a policy: a_x = δ / (1 + |δ|) and a_s = Δs / state_scale.
 
     An episode then equals `npa_envs.rollout` of the rule up to rounding, unless the environment
-    clips state steps to ± `state_scale` or observations to ± `observation_limit`. Actions are
-    computed on the rule's device.
+    clips state steps or observations. Actions are computed on the rule's device.
 
     Args:
         rule: The rule, which is not copied.

@@ -16,8 +16,7 @@ from npa_envs.world.particles import Particles
 class RecognisingShapeshifter:
     """Choose the code whose picture is most like the goal's picture in the observation.
 
-    It takes the picture of each code from `env`, `npa/Shapeshifter2D-v0`, single or vector, with
-    either form of actions.
+    `env`, `npa/Shapeshifter2D-v0` of any form, has the picture of each code.
     """
 
     def __init__(self, env: Any) -> None:

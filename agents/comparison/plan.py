@@ -1,8 +1,7 @@
 """The plan of a comparison: its tasks, its runs (`Job`) and their budgets.
 
-Tasks are small enough for all methods: worlds are smaller and episodes shorter than the paper's, so
-that reinforcement learning and evolution run many of them in a minute, and states have few channels
-and change in small steps, so that there is less to explore.
+Tasks are small enough for all methods: worlds are smaller and episodes shorter than the paper's,
+for many episodes a minute. States have few channels and change in small steps: less to explore.
 """
 
 from __future__ import annotations

@@ -45,8 +45,7 @@ from npa_envs.render import write_png
 Status = Literal["done", "diverged", "failed"]
 
 RECORD, REQUEST, OUTPUT, PICTURE = "run.json", "request.json", "output.txt", "picture.png"
-"""Files of a run: its record, the request to its process, its process's output, and a picture of
-the end of a held-out episode."""
+"""Files of a run: record, request to its process, output, the end of a held-out episode."""
 
 PICTURE_SIDE = 192
 """Pixels on each side of a picture."""
@@ -127,8 +126,7 @@ def requested_run(folder: Path) -> RunRecord:
 def run(folder: Path, device: str, teacher: str = "") -> None:
     """Do the run of a folder's `request.json`; write record, rules and picture into the folder.
 
-    Errors are recorded, so that other runs can continue. `teacher` is the folder of the run whose
-    rules are cloned; "": none.
+    Errors are recorded, and other runs continue. `teacher`: folder of rules to clone; "": none.
     """
     record, begin = requested_run(folder), time.perf_counter()
     curve: list[CurvePoint] = []
@@ -205,7 +203,7 @@ def final_picture(
 
 
 def main(folder: Path) -> None:
-    """Load the libraries that the run in `folder` needs; do each run that standard input orders."""
+    """Import what the run in `folder` needs; do the run that each line of standard input orders."""
     orders: SimpleQueue[tuple[str, str, str]] = SimpleQueue()
 
     def listen() -> None:
@@ -278,8 +276,7 @@ class RunProcess(Child):
 def shares_process(plan: ComparisonPlan, job: Job) -> bool:
     """Return whether the process of a run may do other runs before and after it.
 
-    Runs with a time budget have separate processes, for equal conditions, and so do functions from
-    outside this library, which may leave objects in memory.
+    Runs of a time budget, and of functions that may leave objects in memory, each have a process.
     """
     from_outside = ":" in plan.own.get(job.method, job.method)
     # Other systems cannot rename a folder in which a process has an open file.
@@ -322,8 +319,8 @@ def run_jobs(
     A process does several runs with budgets of particle-steps, as long as none fails. Other runs
     have a process each; on GPUs it loads its libraries while an earlier run learns. A run's folder
     appears when the run is over. An interrupt ends all processes and removes unfinished folders.
-    No run starts after `max_seconds`. `folder` is that of the comparison, `command` its command
-    line, and `written` is called with each record.
+    No run starts after `max_seconds`. `command` is the comparison's, `folder` its folder; `written`
+    is called with each record.
     """
     _check_teachers(plan, jobs, folder)
     # Remove unfinished runs of a killed comparison.

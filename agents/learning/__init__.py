@@ -1,12 +1,10 @@
 """Learners of policies behind one interface, imported as `npa_envs.agents.learning`.
 
 `train(method, problem, budget, seed)` runs any of `METHODS` on a `Problem`, an environment with its
-keywords, and returns rules and a learning curve. Each method is a function in its own module, which
-is imported with its libraries when it is used.
+keywords, and returns rules and a learning curve. A method's module is imported when it is used.
 
 What the methods share: `problem.py` makes the worlds, `rule_set.py` has the rules as functions,
-`progress.py` the budget, the learning curve and checkpoints, `actor_critic.py` the parts of the
-actor-critics `ppo.py`, `sb3.py` and `shac.py`.
+`progress.py` budget, learning curve and checkpoints, `actor_critic.py` parts of PPO and SHAC.
 """
 
 from __future__ import annotations
@@ -55,9 +53,8 @@ METHODS: dict[str, str] = {
     "zero": "npa_envs.agents.learning.untrained_methods:train_zero",
     "scripted": "npa_envs.agents.learning.untrained_methods:train_scripted",
 }
-"""Methods: functions `f(progress, ...)` of a `Progress` that return a `RuleSet` or a policy. The
-options of a method are its keyword-only arguments, or the fields of a dataclass, the default of its
-argument `options`. You may add methods."""
+"""Methods: functions `f(progress, ...)` of a `Progress` that return a `RuleSet` or policy. Options
+are keyword-only arguments, or a dataclass, the default of `options`. You may add methods."""
 
 KEPT_METHODS = ("ppo", "shac")
 """Methods whose runs can be written to a folder, resumed, and shared by several processes."""
@@ -217,8 +214,7 @@ def method_options(method: str) -> dict[str, Any]:
     """Return the options of a method, with their defaults.
 
     Args:
-        method: A name from `METHODS` or, if not there, `GARDEN_METHODS`; or your own function,
-            "package.module:function".
+        method: From `METHODS` or else `GARDEN_METHODS`; or a function, "package.module:function".
     """
     return _options_of(_function(method, GARDEN_METHODS | METHODS))
 

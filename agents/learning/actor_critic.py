@@ -6,7 +6,7 @@ import copy
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal, NamedTuple, get_args
+from typing import Any, Literal, NamedTuple, get_args
 
 import torch
 from torch import Tensor, nn
@@ -28,14 +28,15 @@ class Schedule(NamedTuple):
     target_kl: float
 
 
-NEW_RULES = Schedule(
-    learning_rate=1e-3, initial_std=0.2, last_noise=0.25, critic_rounds=0, target_kl=0.2
-)
-
-START_RULES = Schedule(
-    learning_rate=1e-4, initial_std=0.05, last_noise=1.0, critic_rounds=4, target_kl=0.05
-)
-"""Defaults with a `start`: much noise, large steps and an untrained critic would spoil it."""
+SCHEDULES = {
+    # Option: default for new rules, default with a `start`.
+    "learning_rate": (1e-3, 1e-4),
+    "initial_std": (0.2, 0.05),
+    "last_noise": (0.25, 1.0),
+    "critic_rounds": (0, 4),
+    "target_kl": (0.2, 0.05),
+}
+"""The two defaults: much noise, large steps and an untrained critic would spoil a `start`."""
 
 CRITIC_RATE = 1e-3
 """Adam's learning rate for the critic."""
@@ -49,40 +50,34 @@ CriticInput = Literal["particle", "central"]
 
 @dataclass(frozen=True, kw_only=True)
 class CommonOptions:
-    """Options of both PPOs: `ppo.py` and Stable-Baselines3's. "None: A, or B with a `start`" means
-    that None is A for new rules, and B for a run that begins with the rules `start`."""
+    """Options of both PPOs: `ppo.py` and Stable-Baselines3's. `SCHEDULES` says what None is."""
 
     steps: int = 16
     """Steps of all worlds in a round, T."""
     epochs: int = 4
     """Passes over a round; fewer where `target_kl` is exceeded."""
     learning_rate: float | None = None
-    """Adam's learning rate at first; it falls to zero over the budget. None: 0.001, or 0.0001 with
-    a `start`."""
+    """Adam's learning rate at first; it falls to zero over the budget."""
     minibatches: int = 4
     """Minibatches of a pass, which is shuffled."""
     gamma: float = 0.5
-    """Discount of a reward one step later (dimensionless). It is low, as a step's reward is what
-    that step itself improves; raise it if rewards come late."""
+    """Discount of a reward one step later (dimensionless); raise it if rewards come late."""
     gae_lambda: float = 0.9
     """λ of generalised advantage estimation (dimensionless)."""
     entropy_weight: float = 0.0
     """Weight of an action's entropy in the objective (dimensionless)."""
     max_gradient_norm: float = 0.5
-    """Gradients are clipped to this norm: separately for rules and critic in `ppo.py`, together in
-    Stable-Baselines3."""
+    """Gradients are clipped to this norm, in `ppo.py` separately for rules and for the critic."""
     target_kl: float | None = None
-    """Rules stop learning from a round once their KL divergence from the rules that played it is
-    larger [nats]. None: 0.2, or 0.05 with a `start`."""
+    """Largest KL divergence [nats] from the rules that played a round; then rules stop learning."""
     initial_std: float | None = None
-    """Standard deviation of all columns of actions at first. None: 0.2, or 0.05 with a `start`."""
+    """Standard deviation of all columns of actions at first."""
     last_noise: float | None = None
-    """Factor on the standard deviations at the end of the budget (dimensionless). None: 0.25, or 1
-    with a `start`."""
+    """Factor on the standard deviations at the end of the budget (dimensionless)."""
     noise_decay_share: float = 0.5
     """Last fraction of the budget, in which standard deviations fall by the factor `last_noise`."""
     critic_rounds: int | None = None
-    """Number of first rounds, in which only the critic learns. None: 0, or 4 with a `start`."""
+    """Number of first rounds, in which only the critic learns."""
     critic: CriticInput = "particle"
     """Input of the critic: a particle's own perception, or also its whole world ("central")."""
 
@@ -102,9 +97,11 @@ class CommonOptions:
 
     def schedule(self, start: RuleSet | None) -> Schedule:
         """Return the options that depend on `start`, the rules to begin with, without None."""
-        chosen = {name: getattr(self, name) for name in Schedule._fields}
-        chosen = {name: value for name, value in chosen.items() if value is not None}
-        return (NEW_RULES if start is None else START_RULES)._replace(**chosen)
+        given = {name: getattr(self, name) for name in SCHEDULES}
+        defaults: dict[str, Any] = {
+            name: pair[start is not None] for name, pair in SCHEDULES.items()
+        }
+        return Schedule(**defaults | {name: n for name, n in given.items() if n is not None})
 
     def noise_factor(self, remaining_budget: float, last_noise: float) -> float:
         """Return the factor on the first standard deviations, for the budget's remaining fraction.

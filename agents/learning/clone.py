@@ -26,11 +26,9 @@ class CloneOptions:
     """Options of behaviour cloning."""
 
     teacher: Source | Iterable[Source] | None = None
-    """Rules to imitate: a rule, a shipped rule's name or a file, for all species or one for each,
-    or a set of rules. None: the rules imitate a dataset."""
+    """Rules to imitate, as of `RuleSet.of`. None: the rules imitate a dataset."""
     dataset: str | None = None
-    """Id of a Minari dataset to imitate instead of a teacher; each use of one of its steps counts
-    as particle-steps. None: there is a teacher."""
+    """Id of a Minari dataset to imitate; each use of a step counts. None: there is a teacher."""
     student_share: float = 0.5
     """Fraction of the worlds in which the new rules act, in [0, 1]; 0: only the teacher acts."""
     collect_steps: int = 8
@@ -55,8 +53,7 @@ def train(progress: Progress, options: CloneOptions = CloneOptions()) -> RuleSet
     """Return rules, the student, that imitate the actions of a teacher or of a dataset.
 
     The loss is `unexplained_variance`. In a fraction of the worlds the student acts, so that it
-    learns the teacher's actions also in states that its own errors lead to (dataset aggregation,
-    Ross et al. 2011).
+    learns the teacher's actions also where its own errors lead (DAgger, Ross et al. 2011).
     """
     device, rules = progress.device, progress.first_rules()
     generator = torch.Generator(device).manual_seed(progress.seed)
@@ -136,8 +133,7 @@ def _from_dataset(progress: Progress, options: CloneOptions) -> Demonstrations:
 def unexplained_variance(rules: RuleSet, observation: Tensor, action: Tensor) -> Tensor:
     """Return 1 - R²: the squared error of the rules' actions over the variance of the teacher's.
 
-    It is a mean over species and columns, for observations [B, N, P] and the teacher's actions
-    [B, N, A].
+    It is a mean over species and columns, for observations [B, N, P] and actions [B, N, A].
     """
     ratios, errors = [], (rules.mean(observation) - action).square()
     for span in rules.spans:

@@ -27,16 +27,14 @@ class GradientOptions:
     """Options of gradient descent; `TrainConfig`, which most are passed to, checks them."""
 
     steps: tuple[int, int] | None = None
-    """Range [lo, hi) of the steps of a rollout; None: whole episodes of up to 96 steps, and 32 to
-    96 steps of longer ones."""
+    """Range [lo, hi) of a rollout's steps; None: whole episodes, or 32 to 96 steps of long ones."""
     num_envs: int = 8
     """Worlds of a batch, B."""
     pool_size: int | None = None
     """Worlds that are stored between batches, from which rollouts continue; 0: all rollouts start
     new episodes. None: 64 if rollouts are shorter than episodes (or a batch, if larger), else 0."""
     fresh_share: float = 0.25
-    """Fraction of each batch from the pool that starts new episodes, at least one world
-    (dimensionless)."""
+    """Fraction of a batch from the pool that starts new episodes; at least one world does."""
     learning_rate: float = 4e-3
     """AdamW's learning rate at first."""
     last_rate: float = 0.05

@@ -2,21 +2,19 @@
 
 Source: Schulman et al., arXiv 1707.06347. A round is a rollout of `steps` steps of all worlds, its
 advantages (both in `PPOLearner.play`), and `epochs` passes over it in minibatches
-(`PPOLearner.improve`). The formulas are at the end of the file; actor, critic and the indices of
-minibatches are in `actor_critic.py`.
+(`PPOLearner.improve`). Formulas follow the learner. `actor_critic.py` has actor and critic.
 
 The CPU reads one byte per world in each step (whether its episode ended) and one number per pass.
 On CUDA most work is captured once in CUDA graphs, as launching its short kernels one by one takes
-longer than running them. So results are written in place, into `RoundBuffers`.
+longer than running them. `GraphedFunctions` has these functions, with their fixed tensors.
 """
 
 from __future__ import annotations
 
-import weakref
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -39,7 +37,6 @@ from npa_envs.agents.learning.problem import (
 )
 from npa_envs.agents.learning.progress import Progress
 from npa_envs.agents.learning.rule_set import RuleSet
-from npa_envs.agents.learning.species_env import ConcatenatedSpeciesEnv
 from npa_envs.checks import check_flag, check_positive, check_word
 from npa_envs.envs.core.step_report import PARTICLE_REWARDS
 from npa_envs.envs.core.world_state import free_bytes, needed_bytes
@@ -50,7 +47,7 @@ from npa_envs.training.process_group import (
     begin_episodes,
     generator_to_register,
 )
-from npa_envs.world.cuda_graph import GraphedCallable
+from npa_envs.world.cuda_graph import GraphedCallable, WeakFunction
 from npa_envs.wrappers.base import own_rewards
 
 MANY_PARTICLES = 2**17
@@ -74,8 +71,7 @@ class PPOOptions(CommonOptions):
     """Likelihood ratios are clipped to 1 ± this (dimensionless). None: 0.2, or 0.02 with
     `ratio="world"`, where log-ratios are means over many particles."""
     ratio: Literal["particle", "world"] = "particle"
-    """One likelihood ratio for each particle, or one for each world: of the mean log-probability
-    of its particles."""
+    """One likelihood ratio per particle, or per world: of its particles' mean log-probability."""
     particle_rewards: str | None = None
     """Reward of each particle: "particle", its own part of its world's reward; "marginal", the
     difference that its action makes to the world's. None: its world's reward."""
@@ -140,89 +136,50 @@ class Round(NamedTuple):
 
 
 class RoundBuffers:
-    """Tensors of a round and of its updates, which each round overwrites.
+    """Tensors of a round, T steps of B worlds of N particles; each round overwrites them in place.
 
-    CUDA graphs read and write them in place. The shape is [T, B, N] where no other is given. At
-    first the worlds have the observations `observation`, shape [B, N, P].
+    At first the worlds have the observations `observation`, shape [B, N, P].
     """
 
-    def __init__(
-        self, options: PPOOptions, observation: Tensor, action_dim: int, minibatch_count: int
-    ) -> None:
+    def __init__(self, options: PPOOptions, observation: Tensor, action_dim: int) -> None:
         steps, (worlds, particles) = options.steps, observation.shape[:2]
-
-        def zeros(*shape: int, dtype: torch.dtype = observation.dtype) -> Tensor:
-            return observation.new_zeros(shape, dtype=dtype)
-
-        self.current_observation = observation.clone()
-        """Observations before the current step, shape [B, N, P]."""
-        self.current_action = zeros(worlds, particles, action_dim)
-        """Actions of the current step, shape [B, N, A]."""
-        self.current_log_prob = zeros(worlds, particles)
-        """Log-probabilities of the current step's actions, shape [B, N]."""
-        single = (steps, worlds, particles)
+        single, zeros = (steps, worlds, particles), observation.new_zeros
         self.observations = zeros(steps + 1, *observation.shape)
         """Observations before each step, and after the last one, shape [T + 1, B, N, P]."""
         self.observations[-1].copy_(observation)
         self.actions = zeros(*single, action_dim)
-        self.rewards, self.log_probs, self.targets = (zeros(*single) for _ in range(3))
-        """Rewards of the steps; the others are fields of `Round`, and so are `actions`, `acted`."""
+        """Actions before they are clipped to the action space, shape [T, B, N, A]."""
+        self.log_probs = zeros(single)
+        """Log-probabilities of the actions [nats], shape [T, B, N]."""
+        self.rewards = zeros(single)
+        """Rewards of the steps, shape [T, B, N]."""
         self.acted = torch.ones_like(self.rewards)
-        self.terminated, self.ended = (zeros(*single, dtype=torch.bool) for _ in range(2))
-        """Whether a particle's episode terminated in a step; whether it terminated or truncated."""
+        """1 where an action counts, else 0, shape [T, B, N]."""
+        self.terminated = zeros(single, dtype=torch.bool)
+        """Whether a particle's episode terminated in a step, shape [T, B, N]."""
+        self.ended = zeros(single, dtype=torch.bool)
+        """Whether it terminated or was truncated, shape [T, B, N]."""
         self.values = zeros(steps + 1, worlds, particles)
         """The critic's values of `observations`, shape [T + 1, B, N]."""
-        self.next_values = zeros(*single)
-        """The critic's values of the observations after each step, before any restart."""
+        self.next_values = zeros(single)
+        """Values of the observations after each step, before any restart, shape [T, B, N]."""
         self.advantages = zeros(steps, worlds, 1 if options.ratio == "world" else particles)
-        self.within_kl = zeros()
+        """Standardised advantages, shape [T, B, N], or [T, B, 1] with `ratio="world"`."""
+        self.targets = zeros(single)
+        """Targets of the critic, shape [T, B, N]."""
+        parts = (self.actions, self.log_probs, self.advantages, self.targets, self.acted)
+        self.round = Round(*(part.flatten(0, 1) for part in (self.observations[:-1], *parts)))
+        """These tensors as a `Round`."""
+        self.within_kl = zeros(())
         """1, or 0 once the rules have moved farther than `target_kl` in a round, shape []."""
-        self.rules_rate = zeros()
+        self.rules_rate = zeros(())
         """Learning rate of the rules while `within_kl` is 1, shape []."""
-        self.kl_sums = zeros(2)
-        """Sums of a minibatch's KL estimates [nats] and of their weights, shape [2]."""
-        self.weight_sums = zeros(minibatch_count, 2)
-        """Sums of `acted` over the critic's and over the rules' samples, [minibatches, 2]."""
-
-    @property
-    def round(self) -> Round:
-        """The round as views of these tensors."""
-        others = (self.actions, self.log_probs, self.advantages, self.targets, self.acted)
-        return Round(*(values.flatten(0, 1) for values in (self.observations[:-1], *others)))
-
-
-class GraphedParts:
-    """Methods of a `PPOLearner`, which run as CUDA graphs on CUDA, and as they are on a CPU.
-
-    `graphed.draw_actions()` does what `learner.draw_actions()` does, and so on. They have neither
-    arguments nor results: they read and write the tensors of `buffers` that their docstrings name.
-    """
-
-    def __init__(self, learner: PPOLearner, device: torch.device) -> None:
-        graph = partial(GraphedCallable, device=device)
-        self.draw_actions = graph(
-            learner.draw_actions, generator=generator_to_register(learner.random)
-        )
-        self.compute_values = graph(learner.compute_values)
-        captured = not learner.processes.distributed
-        self.compute_advantages = graph(learner.compute_advantages, captured=captured)
-        # Updates share memory.
-        pool = torch.cuda.graph_pool_handle() if device.type == "cuda" else None
-        self.sum_weights = graph(learner.sum_weights, pool=pool)
-        # The learner has these graphs, so they refer to it weakly.
-        weak = weakref.proxy(learner)
-        self.compute_gradients = [
-            graph(partial(PPOLearner.compute_gradients, weak, minibatch), pool=pool)
-            for minibatch in range(learner.minibatches.count)
-        ]
-        self.descend_both = graph(learner.descend_both, pool=pool)
 
 
 class PPOLearner:
     """Rules, critic and worlds, which alternately `play` a round and `improve` from it.
 
-    With several processes each has some of the worlds, which have separate random streams.
-    Gradients, running moments and sums of weights are averaged over processes.
+    Each of several processes has some worlds; they average gradients, moments and sums of weights.
     """
 
     def __init__(self, progress: Progress, options: PPOOptions) -> None:
@@ -261,10 +218,8 @@ class PPOLearner:
         )
         observation = self._reset_worlds(0)
         self.critic.observe(observation, self.processes)
-        self.buffers = RoundBuffers(
-            options, observation, problem.interface.action_dim, self.minibatches.count
-        )
-        self.graphed = GraphedParts(self, device)
+        self.buffers = RoundBuffers(options, observation, problem.interface.action_dim)
+        self.graphed = GraphedFunctions(self)
 
     def resume(self, iteration: int, resumption: int) -> None:
         """Begin new worlds after `iteration` rounds; `resumption`: number of resumes so far."""
@@ -273,154 +228,155 @@ class PPOLearner:
 
     def _reset_worlds(self, resumption: int) -> Tensor:
         seeds = world_seeds(self._seed, self._total, resumption)
-        observation: Tensor
-        observation, _ = self.envs.reset(seed=[seeds[k] for k in self._indices])
+        observation: Tensor = self.envs.reset(seed=[seeds[k] for k in self._indices])[0]
         return observation
 
     @torch.no_grad()
     def play(self) -> Round:
         """Roll out T steps of all worlds, and estimate advantages; return views of the buffers."""
-        buffers, options = self.buffers, self.options
+        buffers, graphed = self.buffers, self.graphed
         buffers.observations[0].copy_(buffers.observations[-1])
-        last_observations = {}
-        for step in range(options.steps):
-            buffers.current_observation.copy_(buffers.observations[step])
-            self.graphed.draw_actions()
-            buffers.actions[step].copy_(buffers.current_action)
-            buffers.log_probs[step].copy_(buffers.current_log_prob)
-            last_observation = self._step_worlds(step)
-            if last_observation is not None:
-                last_observations[step] = last_observation
-        self.graphed.compute_values()
+        last_observations = []
+        for step in range(self.options.steps):
+            action, log_prob = graphed.draw_actions(buffers.observations[step])
+            buffers.actions[step].copy_(action)
+            buffers.log_probs[step].copy_(log_prob)
+            last_observations.append(self._step_worlds(step, action))
+        values, next_values = graphed.compute_values(buffers.observations)
         # `observations` has the first ones of the next episodes in place of these.
-        for step, observation in last_observations.items():
-            buffers.next_values[step].copy_(self.critic(observation))
-        self.graphed.compute_advantages()
+        for step, observation in enumerate(last_observations):
+            if observation is not None:
+                next_values[step].copy_(self.critic(observation))
+        rewards, ends = buffers.rewards, (buffers.terminated, buffers.ended)
+        graphed.compute_advantages(rewards, values, next_values, *ends, buffers.acted)
         return buffers.round
 
-    def _step_worlds(self, step: int) -> Tensor | None:
-        """Apply `current_action`, and write the results of the step into the buffers.
+    def _step_worlds(self, step: int, action: Tensor) -> Tensor | None:
+        """Apply actions [B, N, A], and write the results of the step into the buffers.
 
         Return the last observations of episodes, [B, N, P], where one ended; None if none did.
         """
-        buffers, options = self.buffers, self.options
-        observation, reward, terminated, truncated, infos = self.envs.step(buffers.current_action)
+        buffers = self.buffers
+        observation, reward, terminated, truncated, infos = self.envs.step(action)
         # Flags and rewards of worlds, [B, 1], are those of all of their particles.
         terminated, ended = terminated[:, None], (terminated | truncated)[:, None]
-        if isinstance(self.envs, ConcatenatedSpeciesEnv):
-            # A species may end before its world does.
-            terminated = terminated | infos["particle_terminated"]
-            ended = ended | infos["particle_terminated"]
-            buffers.acted[step].copy_(infos["acted"])
-        elif options.masked:
-            # It describes the step before a restart.
-            buffers.acted[step].copy_(infos["updated"])
+        # A species may end before its world does.
+        if (own_end := infos.get("particle_terminated")) is not None:
+            terminated, ended = terminated | own_end, ended | own_end
+        # Both describe the step before a restart.
+        if (acted := infos.get("acted", infos.get("updated"))) is not None:
+            buffers.acted[step].copy_(acted)
         buffers.observations[step + 1].copy_(observation)
-        buffers.rewards[step].copy_(
-            reward[:, None] if options.particle_rewards is None else own_rewards(infos)
-        )
+        own = self.options.particle_rewards is not None
+        buffers.rewards[step].copy_(own_rewards(infos) if own else reward[:, None])
         buffers.terminated[step].copy_(terminated)
         buffers.ended[step].copy_(ended)
         last: Tensor | None = infos.get("final_obs")
         return last
 
     @torch.no_grad()
-    def draw_actions(self) -> None:
-        """Draw actions: from `current_observation` to `current_action` and `current_log_prob`."""
+    def draw_actions(self, observation: Tensor) -> tuple[Tensor, Tensor]:
+        """Return random actions [B, N, A] and their log-probabilities [B, N]."""
         begin_episodes(self.random)
-        action, log_prob = self.actor.sample(self.buffers.current_observation, self.random)
-        self.buffers.current_action.copy_(action)
-        self.buffers.current_log_prob.copy_(log_prob)
+        return self.actor.sample(observation, self.random)
 
     @torch.no_grad()
-    def compute_values(self) -> None:
-        """Write `values`, in chunks to save memory, and `next_values` as if no episode ended."""
-        buffers, observations = self.buffers, self.buffers.observations.flatten(0, 1)
-        size = -(-len(observations) // self.options.minibatches)
-        values = torch.cat([self.critic(chunk) for chunk in torch.split(observations, size)])
-        buffers.values.copy_(values.view_as(buffers.values))
-        buffers.next_values.copy_(buffers.values[1:])
+    def compute_values(self, observations: Tensor) -> tuple[Tensor, Tensor]:
+        """Return `values` of observations, and `next_values` as if no episode ended."""
+        flat = observations.flatten(0, 1)
+        # Chunks save memory.
+        chunks = torch.split(flat, -(-len(flat) // self.options.minibatches))
+        values = torch.cat([self.critic(chunk) for chunk in chunks]).view(observations.shape[:-1])
+        return values, values[1:]
 
     @torch.no_grad()
-    def compute_advantages(self) -> None:
-        """Write standardised `advantages` and the critic's `targets`, from rewards and values."""
-        buffers, values = self.buffers, self.buffers.values[:-1]
+    def compute_advantages(
+        self,
+        rewards: Tensor,
+        values: Tensor,
+        next_values: Tensor,
+        terminated: Tensor,
+        ended: Tensor,
+        acted: Tensor,
+    ) -> tuple[Tensor, Tensor]:
+        """Return standardised advantages, and targets of the critic, as in `RoundBuffers`."""
+        gamma, gae_lambda, values = self.options.gamma, self.options.gae_lambda, values[:-1]
         advantages = generalised_advantages(
-            buffers.rewards,
-            values,
-            buffers.next_values,
-            buffers.terminated,
-            buffers.ended,
-            gamma=self.options.gamma,
-            gae_lambda=self.options.gae_lambda,
+            rewards, values, next_values, terminated, ended, gamma=gamma, gae_lambda=gae_lambda
         )
-        buffers.targets.copy_(advantages + values)
+        targets = advantages + values
         if self.options.ratio == "world":
-            advantages = particle_means(advantages, buffers.acted)
-        buffers.advantages.copy_(standardised(advantages, buffers.acted, self.processes))
+            advantages = particle_means(advantages, acted)
+        return standardised(advantages, acted, self.processes), targets
 
     def improve(self, remaining_budget: float) -> None:
         """Train rules and critic by `epochs` passes over the last round.
 
-        Learning rates, and the noise of the next round, fall with the remaining fraction of the
-        budget.
+        Learning rates and the next round's noise fall with the remaining fraction of the budget.
         """
-        schedule, buffers = self.schedule, self.buffers
+        schedule, buffers, graphed = self.schedule, self.buffers, self.graphed
+        batch, within_kl, rules_rate = buffers.round, buffers.within_kl, buffers.rules_rate
         critic, actor = (self.optimisers[name] for name in ("critic", "actor"))
         rules_learn = self.rounds >= schedule.critic_rounds
         self.rounds += 1
         self.critic.observe(buffers.observations[:-1], self.processes)
         self.critic.rescale(buffers.targets, self.processes)
         critic.param_groups[0]["lr"].fill_(CRITIC_RATE * remaining_budget)
-        buffers.rules_rate.fill_(schedule.learning_rate * remaining_budget)
-        buffers.within_kl.fill_(1.0)
+        rules_rate.fill_(schedule.learning_rate * remaining_budget)
+        within_kl.fill_(1.0)
         for _ in range(self.options.epochs):
             self.minibatches.shuffle()
-            self.graphed.sum_weights()
-            self.processes.reduce([buffers.weight_sums])
+            (weight_sums,) = graphed.sum_weights(batch.acted)
+            self.processes.reduce([weight_sums])
             for minibatch in range(self.minibatches.count):
                 if rules_learn:
-                    self.graphed.compute_gradients[minibatch]()
-                    self.processes.reduce(
-                        [*gradients_of(critic), *gradients_of(actor), buffers.kl_sums]
-                    )
-                    self.graphed.descend_both()
+                    (kl_sums,) = graphed.compute_gradients[minibatch](weight_sums, *batch)
+                    self.processes.reduce([*gradients_of(critic), *gradients_of(actor), kl_sums])
+                    graphed.descend_both(kl_sums, rules_rate, within_kl)
                 else:
-                    self._compute_critic_gradients(minibatch)
+                    self._compute_critic_gradients(minibatch, weight_sums, batch)
                     self.processes.reduce(gradients_of(critic))
                     self._descend(critic)
             # The only synchronisation with the device.
-            if not bool(buffers.within_kl):
+            if not bool(within_kl):
                 break
         self.actor.set_noise(self.options.noise_factor(remaining_budget, schedule.last_noise))
 
-    def sum_weights(self) -> None:
-        """Write `weight_sums`: the sums of `acted` in each minibatch of a pass."""
-        acted = self.buffers.round.acted
+    def sum_weights(self, acted: Tensor) -> tuple[Tensor]:
+        """Return each minibatch's sums of `acted`: the critic's, the rules'; [minibatches, 2]."""
+        sums = []
         for minibatch, critic_index in enumerate(self.minibatches.indices[-1]):
             rows = torch.cat([group for (group,) in self._rule_rows(minibatch, [acted])])
-            sums = acted[critic_index].sum(), self._ratio_weights(rows).sum()
-            self.buffers.weight_sums[minibatch].copy_(torch.stack(sums))
+            sums += [acted[critic_index].sum(), self._ratio_weights(rows).sum()]
+        return (torch.stack(sums).view(-1, 2),)
 
-    def compute_gradients(self, minibatch: int) -> None:
-        """Write the gradients of critic and rules for a minibatch of `round`, and its `kl_sums`."""
-        self._compute_critic_gradients(minibatch)
-        objective, kl_sums = self._objective(minibatch)
+    def compute_gradients(
+        self, minibatch: int, weight_sums: Tensor, *fields: Tensor
+    ) -> tuple[Tensor]:
+        """Write the gradients of critic and rules for a minibatch of the round of these `fields`.
+
+        Return the sums of the minibatch's KL estimates [nats] and of their weights, shape [2].
+        """
+        batch = Round(*fields)
+        self._compute_critic_gradients(minibatch, weight_sums, batch)
+        objective, kl_sums = self._objective(minibatch, weight_sums, batch)
         set_gradients(self.optimisers["actor"], -objective)
-        self.buffers.kl_sums.copy_(kl_sums)
+        return (kl_sums,)
 
-    def _compute_critic_gradients(self, minibatch: int) -> None:
+    def _compute_critic_gradients(self, minibatch: int, weight_sums: Tensor, batch: Round) -> None:
         index = self.minibatches.indices[-1][minibatch]
-        worlds = Round(*(values[index] for values in self.buffers.round))
+        worlds = Round(*(values[index] for values in batch))
         error = (self.critic(worlds.observations) - worlds.targets) / self.critic.scale
         squares = (worlds.acted * error.square()).sum()
-        loss = 0.5 * squares / self.buffers.weight_sums[minibatch, 0].clamp(min=1.0)
+        loss = 0.5 * squares / weight_sums[minibatch, 0].clamp(min=1.0)
         set_gradients(self.optimisers["critic"], loss)
 
-    def _objective(self, minibatch: int) -> tuple[Tensor, Tensor]:
-        """Return PPO's clipped objective of a minibatch, shape [], and its `kl_sums`, shape [2]."""
+    def _objective(
+        self, minibatch: int, weight_sums: Tensor, batch: Round
+    ) -> tuple[Tensor, Tensor]:
+        """Return PPO's clipped objective of a minibatch, shape [], and its KL sums, shape [2]."""
         options, actor = self.options, self.actor
-        groups = [Round(*rows) for rows in self._rule_rows(minibatch, self.buffers.round)]
+        groups = [Round(*rows) for rows in self._rule_rows(minibatch, batch)]
         if options.ratio == "world":
             (worlds,) = groups
             log_probs = [actor.log_prob(worlds.observations, worlds.actions)]
@@ -439,7 +395,7 @@ class PPOLearner:
         kl_sums = torch.stack((divergence, acted.sum()))
         if options.ratio == "world":
             log_ratio = particle_means(log_ratio, acted)
-        weights, total = self._ratio_weights(acted), self.buffers.weight_sums[minibatch, 1]
+        weights, total = self._ratio_weights(acted), weight_sums[minibatch, 1]
         objective = clipped_objective(
             log_ratio, advantages, weights, total, clip=options.clip_range
         )
@@ -447,16 +403,16 @@ class PPOLearner:
             objective = objective + options.entropy_weight * actor.entropy()
         return objective, kl_sums
 
-    def descend_both(self) -> None:
-        """Step critic and rules along their gradients; rules stay once `within_kl` is 0."""
+    def descend_both(self, kl_sums: Tensor, rules_rate: Tensor, within_kl: Tensor) -> tuple[Tensor]:
+        """Step the critic, and rules while `within_kl` is 1; update `within_kl` and return it."""
         self._descend(self.optimisers["critic"])
         # Rules that moved too far get the learning rate 0, without a synchronisation.
-        divergence, count = self.buffers.kl_sums
-        self.buffers.within_kl.mul_(divergence / count.clamp(min=1.0) <= self.schedule.target_kl)
+        divergence, count = kl_sums
+        within_kl.mul_(divergence / count.clamp(min=1.0) <= self.schedule.target_kl)
         optimiser = self.optimisers["actor"]
-        rate = self.buffers.within_kl * self.buffers.rules_rate
-        optimiser.param_groups[0]["lr"].copy_(rate)
+        optimiser.param_groups[0]["lr"].copy_(within_kl * rules_rate)
         self._descend(optimiser)
+        return (within_kl,)
 
     def _descend(self, optimiser: torch.optim.Optimizer) -> None:
         parameters = optimiser.param_groups[0]["params"]
@@ -471,7 +427,7 @@ class PPOLearner:
         indices = [group[minibatch] for group in self.minibatches.indices[:-1]]
         if self.options.ratio == "world":
             return [[value[index] for value in values] for index in indices]
-        rows, total = [], self.buffers.acted.shape[2]
+        rows, total = [], self.actor.rules.spans[-1].stop
         for span, index in zip(self.actor.rules.spans, indices, strict=True):
             count = span.stop - span.start
             if count < total:
@@ -497,7 +453,7 @@ def generalised_advantages(
     """Return generalised advantage estimates (Schulman et al., arXiv 1506.02438, equation 16).
 
     All tensors have one shape, [T, ...]. `values` are the critic's before each step, `next_values`
-    those after it, before any restart; they count as 0 where an episode terminated in the step.
+    those after it, before any restart; they count as 0 where an episode `terminated` in the step.
     `ended`: it terminated or was truncated.
     """
     errors = rewards + gamma * next_values.masked_fill(terminated, 0.0) - values
@@ -546,6 +502,77 @@ def clipped_objective(
     clipped = ratio.clamp(1.0 - clip, 1.0 + clip)
     gains = torch.minimum(ratio * advantages, clipped * advantages)
     return (weights * gains).sum() / total.clamp(min=1.0)
+
+
+class GraphedFunction:
+    """A method of tensors that runs as a CUDA graph on CUDA, and unchanged on a CPU.
+
+    A graph reads and writes the same tensors in each call. So a call copies its arguments into
+    `inputs` and the results into `outputs`, which it returns; a tensor is not copied into itself.
+    The method gets `constants` before the inputs. The caller keeps its object alive.
+    """
+
+    def __init__(
+        self,
+        function: Callable[..., tuple[Tensor, ...]],
+        inputs: Sequence[Tensor],
+        outputs: Sequence[Tensor],
+        *constants: Any,
+        **options: Any,
+    ) -> None:
+        self._function, self._constants = WeakFunction(function), constants
+        self._inputs, self._outputs = inputs, outputs
+        self._graph = GraphedCallable(self._run, **options)
+
+    def __call__(self, *arguments: Tensor) -> Sequence[Tensor]:
+        """Return the results for arguments; the next call overwrites them."""
+        _copy_each(arguments, self._inputs)
+        self._graph()
+        return self._outputs
+
+    def _run(self) -> None:
+        _copy_each(self._function()(*self._constants, *self._inputs), self._outputs)
+
+
+def _copy_each(sources: Sequence[Tensor], targets: Sequence[Tensor]) -> None:
+    for source, target in zip(sources, targets, strict=True):
+        if source is not target:
+            target.copy_(source)
+
+
+class GraphedFunctions:
+    """Methods of a `PPOLearner` of the same names, as graphs with their inputs and outputs."""
+
+    def __init__(self, learner: PPOLearner) -> None:
+        buffers, count = learner.buffers, learner.minibatches.count
+        device, zeros = buffers.values.device, buffers.values.new_zeros
+        graph = partial(GraphedFunction, device=device)
+        self.draw_actions = graph(
+            learner.draw_actions,
+            [torch.zeros_like(buffers.observations[0])],
+            [torch.zeros_like(part[0]) for part in (buffers.actions, buffers.log_probs)],
+            generator=generator_to_register(learner.random),
+        )
+        values = [buffers.values, buffers.next_values]
+        self.compute_values = graph(learner.compute_values, [buffers.observations], values)
+        self.compute_advantages = graph(
+            learner.compute_advantages,
+            [buffers.rewards, *values, buffers.terminated, buffers.ended, buffers.acted],
+            [buffers.advantages, buffers.targets],
+            captured=not learner.processes.distributed,
+        )
+        # Updates share memory.
+        pool = torch.cuda.graph_pool_handle() if device.type == "cuda" else None
+        graph, batch = partial(graph, pool=pool), buffers.round
+        weight_sums, kl_sums, within_kl = zeros(count, 2), zeros(2), buffers.within_kl
+        self.sum_weights = graph(learner.sum_weights, [batch.acted], [weight_sums])
+        self.compute_gradients = [
+            graph(learner.compute_gradients, [weight_sums, *batch], [kl_sums], minibatch)
+            for minibatch in range(count)
+        ]
+        self.descend_both = graph(
+            learner.descend_both, [kl_sums, buffers.rules_rate, within_kl], [within_kl]
+        )
 
 
 def total_num_envs(progress: Progress, options: PPOOptions) -> int:

@@ -75,8 +75,7 @@ class Problem:
     """An environment to learn in, with its keywords and sizes."""
 
     env_id: str
-    """Id of an environment of this library, "npa/Mixing-v0", or of your own that is registered with
-    Gymnasium."""
+    """Id of an environment: this library's, "npa/Mixing-v0", or your own, known to Gymnasium."""
     keywords: Mapping[str, Any] = field(default_factory=dict)
     """Keywords of `gym.make` or `multispecies_v0.batched`, of JSON's types."""
     episode_steps: int
@@ -189,12 +188,10 @@ class Problem:
                 several species it is always there: the reward of the particle's species.
             tell_updated: Adds `infos["updated"]`, [B, N]: which actions took effect; not with
                 several species.
-            copy: Return new tensors; False: where possible the same ones, which the next step
-                overwrites.
+            copy: Return new tensors; False: where possible those that the next step overwrites.
 
         Raises:
-            NPAError: The worlds do not fit into memory, the device is unknown, or
-                `particle_rewards` contradicts the problem's keywords.
+            NPAError: Worlds do not fit into memory, or `device` or `particle_rewards` is wrong.
         """
         count = self.num_envs if num_envs is None else num_envs
         device = str(check_device(device))

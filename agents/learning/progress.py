@@ -95,8 +95,7 @@ class Progress:
     the curve, and when SIGTERM or Ctrl-C stops the run. A resumed run continues from the weights,
     optimisers and counts of the checkpoint, on any number of processes, with new episodes.
 
-    With a default process group of torch, all processes use the clock of rank 0, each evaluates the
-    same episodes, and rank 0 reports and writes.
+    In torch's process group all use the clock of rank 0 and evaluate the same episodes; rank 0 writes.
 
     Args:
         initial: Rules to begin with, which are copied; None: new ones.
@@ -160,8 +159,7 @@ class Progress:
     def first_rules(self, *, zero_output: bool = False) -> RuleSet:
         """Return the rules that a method begins with and trains in place, on the device.
 
-        zero_output: New rules do nothing, as their output layers are zero: random ones destroy the
-        picture in `npa/Regeneration2D-v0`.
+        zero_output: New rules do nothing: random ones destroy `npa/Regeneration2D-v0`'s pictures.
         """
         if self.initial is not None:
             return self.initial

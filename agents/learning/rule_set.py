@@ -77,8 +77,7 @@ class RuleSet(nn.Module):
     def of(cls, problem: Problem, source: Source | Iterable[Source]) -> RuleSet:
         """Return copies of existing rules, on the CPU, checked to fit a problem.
 
-        `source` is a rule, or what `npa_envs.load_rule` takes, for all species or one for each; or
-        a folder that `save` wrote.
+        `source`: a rule, its file or name, for all or each species; or a folder that `save` wrote.
         """
         if isinstance(source, str | Path) and (Path(source) / _file_name(0)).is_file():
             return cls.load(source, problem)
@@ -118,8 +117,7 @@ class RuleSet(nn.Module):
     def mean(self, observation: Tensor) -> Tensor:
         """Return actions [B, N, A] for observations: a_x = δ / (1 + |δ|), a_s = Δs / state_scale.
 
-        They are differentiable. Unlike in `policy`, a_s is not clipped to the action space, so that
-        gradients do not vanish.
+        Unlike in `policy`, a_s is not clipped to the action space: gradients do not vanish.
         """
         return self.actions(observation, self.mean_by_rule)
 
@@ -204,8 +202,7 @@ class ClampedWeights(FoldedRule):
 class ClampedRule(NPARule):
     """A rule that shares another rule's parameters and clamps its state steps to ± `limit`.
 
-    In a rollout it acts as the other rule does in an environment with `state_scale` = `limit`
-    (dimensionless).
+    In a rollout it acts as the other rule in an environment whose `state_scale` is `limit`.
     """
 
     def __init__(self, rule: NPARule, limit: float) -> None:

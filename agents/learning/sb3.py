@@ -1,8 +1,7 @@
 """Learners of Stable-Baselines3: PPO over whole worlds; PPO and SAC in gardens.
 
 PPO over worlds has one likelihood for each world: its log-probability is the mean over particles.
-It checks `ppo.py` independently: rollouts, advantages and updates are Stable-Baselines3's; only the
-policy, whose actor is a set of rules, is this library's.
+It checks `ppo.py`: all is Stable-Baselines3's but the policy, whose actor is a set of rules.
 """
 
 from __future__ import annotations
@@ -45,11 +44,10 @@ KL_FACTOR = 1.5
 
 @dataclass(frozen=True, kw_only=True)
 class WorldOptions(CommonOptions):
-    """Options of PPO with one likelihood for each world."""
+    """Options of PPO with one likelihood ratio for each world, that of its joint action."""
 
     clip: float = 0.02
-    """Likelihood ratios are clipped to 1 ± this (dimensionless); it is small, as log-ratios are
-    means over many particles."""
+    """Likelihood ratios, of means over many particles, are clipped to 1 ± this (dimensionless)."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -59,8 +57,7 @@ class WorldOptions(CommonOptions):
 def train(progress: Progress, options: WorldOptions = WorldOptions()) -> RuleSet:
     """Return the rules that Stable-Baselines3's PPO learns within the budget.
 
-    Stable-Baselines3 seeds the global random states of torch and NumPy. Observations are copied to
-    the CPU.
+    It seeds the global random states of torch and NumPy. Observations are copied to the CPU.
     """
     problem, seed, device = progress.problem, progress.seed, progress.device
     schedule = options.schedule(progress.initial)

@@ -57,8 +57,7 @@ class SHACOptions:
     minibatches: int = 4
     """Minibatches of a pass, which is shuffled."""
     critic: CriticInput = "central"
-    """Input of the critic: one "particle" only, or also the mean over its world ("central"). A
-    world's value is the mean over its particles."""
+    """Input of the critic, as of PPO. A world's value is the mean over its particles."""
     target_rate: float = 0.2
     """Fraction of its distance from the critic that the target critic moves after each window."""
 
@@ -102,8 +101,7 @@ class StepWindow(NamedTuple):
 class SHACLearner:
     """Rules, critic and worlds; each call of `learn` runs a window and trains on it.
 
-    With several processes each has some of the worlds, which have separate random streams.
-    Gradients and running moments are averaged over processes.
+    Each of several processes has some worlds; they average gradients and running moments.
     """
 
     def __init__(self, progress: Progress, options: SHACOptions) -> None:
@@ -135,8 +133,7 @@ class SHACLearner:
         begin_episodes(self.random)
         self.worlds = self._new_worlds(list(range(len(self._indices))))
         self.windows_left = [1 + k % self.window_count for k in self._indices]
-        """Windows left of each world's episode: at first different ones, so that a batch has all
-        parts of an episode."""
+        """Windows left of each world's episode; at first they differ, so that batches are mixed."""
 
     def learn(self, rate: float) -> None:
         """Run a window; train the rules on it, at the learning rate `rate`, and the critic."""
@@ -243,11 +240,10 @@ def world_values(critic: Critic, features: Tensor) -> Tensor:
 def td_lambda_targets(
     rewards: Tensor, next_values: Tensor, *, gamma: float, td_lambda: float
 ) -> Tensor:
-    """Return TD(λ) targets of the values before each step of a window, shape [h, ...].
+    """Return TD(λ) targets of a window's values, [h, ...] (arXiv 2204.07137, equation 7).
 
     `rewards` are those of the steps, `next_values` the critic's values after each step. The target
     of step t is r_t + γ ((1 - λ) v_t + λ target of step t + 1), that of the last step r + γ v.
-    Source: arXiv 2204.07137, equation 7.
     """
     targets = torch.empty_like(rewards)
     later = next_values[-1]

@@ -50,7 +50,7 @@ def train_zero(progress: Progress) -> Policy | UnboundGardener:
 def _evaluate_once(
     progress: Progress, policy: Callable[..., Policy], gardener: Any, **options: int
 ) -> Policy | UnboundGardener:
-    """Evaluate and return a new `policy` of particles, or in a garden a new `gardener`."""
+    """Make a `policy(env)`, or in a garden a `gardener(env)`; evaluate it once, and return it."""
     check_no_start(progress)
     result: Policy | UnboundGardener
     if progress.problem.controlled == "brushes":

@@ -143,8 +143,7 @@ class RuleStack(NPARule):
 class Candidates:
     """Evaluates candidates, each in B worlds with the same seeds, by default 0 to B - 1.
 
-    On a CPU candidates share a batch of worlds. On CUDA, where the number of perceptions is not
-    known, they run one after the other.
+    On a CPU candidates share a batch. On CUDA, with perceptions of unknown number, each runs alone.
     """
 
     def __init__(
@@ -235,8 +234,7 @@ def quality_of(worlds: Particles) -> Tensor:
     """Return the quality of B worlds at T times, [T, B, N, ...]: a number in [0, 1], shape [].
 
     It is alive / (1 + mean |s − clip(s, −1, 1)| + mean |x − clip(x, −1, 1)|). `alive` is twice the
-    standard deviation of a particle's colour channels over the T times, averaged over particles
-    and channels: 1 if each flickers between 0 and 1.
+    mean standard deviation of a particle's colour channels over time: 1 if all flicker from 0 to 1.
     """
     excess = [(values - values.clamp(-1.0, 1.0)).abs().mean() for values in worlds.tensors()]
     alive = 2.0 * _colours(worlds).std(dim=0, correction=0).mean()

@@ -132,8 +132,7 @@ EMITTERS: Mapping[str, Callable[[Any, int, int], Any]] = {
 pyribs, whose `ask` proposes candidates, [G, W].
 
 `map-elites` mutates random elites. `cma-me` (arXiv 1912.02400) is CMA-ES that ranks new cells
-before better elites. `cma-es` ranks by quality only. Both adapt a diagonal covariance. `random`
-draws independent candidates.
+before better elites, `cma-es` by quality. Both adapt a diagonal covariance. `random` draws anew.
 """
 
 

@@ -36,12 +36,12 @@ def learner_of(form):
     for module in learner.modules.values():
         module.double()
     if method is ppo:
-        for name, value in vars(learner.buffers).items():
-            if value.is_floating_point():
-                setattr(learner.buffers, name, value.double())
-        # As at the beginning.
+        observation = learner.buffers.observations[-1].double()
+        width = problem.interface.action_dim
+        learner.buffers = ppo.RoundBuffers(learner.options, observation, width)
+        learner.graphed = ppo.GraphedFunctions(learner)
         learner.critic.updates.zero_()
-        learner.critic.observe(learner.buffers.observations[-1], learner.processes)
+        learner.critic.observe(observation, learner.processes)
         return learner
     new_worlds = learner._new_worlds
     learner._new_worlds = lambda worlds: new_worlds(worlds).map(
