@@ -20,7 +20,13 @@ from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.damage import DAMAGE_SIZES
 from npa_envs.tasks.point_classification import class_colours
 from npa_envs.web import messages
-from npa_envs.web.export import check_browser_rule, export_web, page_rule, page_text
+from npa_envs.web.export import (
+    check_browser_rule,
+    export_web,
+    joined_modules,
+    page_rule,
+    page_text,
+)
 from npa_envs.web.live_world import ColouredWorld, Colouring
 from npa_envs.web.rule_world import RuleWorld
 from npa_envs.world.brushes import nearest_image
@@ -245,13 +251,14 @@ def test_particles_have_the_colours_of_the_viewer(run, settings, show):
     assert len(want.unique(dim=0)) > (0 if show == "species" else 1)
 
 
-def test_particles_that_are_no_number_leave_the_components_of_the_others_alone(run):
+def test_particles_that_are_no_number_leave_the_components_of_the_others_alone(run, settings):
     s = torch.randn(40, 4, generator=torch.Generator().manual_seed(2))
     broken = torch.cat((s, s[:2]))
     broken[40, 1], broken[41, 0] = float("nan"), float("inf")
     frames = [packed(states) for states in (broken, torch.full_like(s, float("nan")), s)]
-    first, _, last_one = run("components", channels=4, frames=frames)
-    assert first[:120] == run("components", channels=4, frames=frames[2:])[0]
+    options = {"channels": 4, "constants": settings["constants"]}
+    first, _, last_one = run("components", frames=frames, **options)
+    assert first[:120] == run("components", frames=frames[2:], **options)[0]
     assert len(set(last_one)) > 20
 
 
@@ -302,6 +309,28 @@ def test_a_page_is_one_small_file_that_asks_for_nothing(tmp_path):
     assert "<script>alert(1)" not in text
     assert "<b>" not in text
     assert '"name":"\\u003cb>"' in text
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        'import c from "./b.js";', 'import * as c from "./b.js";', 'import "./b.js";',
+        'import { b as c } from "./b.js";', 'import { b } from "./b.js"', 'await import("./b.js");',
+        "export default 1;", "export { b };", "export let c = 1;", "export function* c() {}",
+        'export * from "./b.js";', "  export const c = 1;",
+    ],
+)  # fmt: skip
+def test_an_import_or_export_of_another_form_is_named_with_file_and_line(
+    tmp_path, monkeypatch, line
+):
+    monkeypatch.setattr("npa_envs.web.export.PAGE", tmp_path)
+    (tmp_path / "b.js").write_text("// To import and export.\nexport const b = 2;\n")
+    known = 'import {\n  b,\n} from "./b.js";\nexport const a = b; // export it\n'
+    (tmp_path / "a.js").write_text(known)
+    assert 'modules["a.js"] = (() => {\nconst {\n  b,\n} = modules[' in joined_modules("a.js")
+    (tmp_path / "a.js").write_text(f"{known}{line}\n")
+    with pytest.raises(ValueError, match=r"in line 5 of .*a\.js"):
+        joined_modules("a.js")
 
 
 class OwnNetwork(NPARule):

@@ -36,8 +36,8 @@ def gecko(device):
     return lambda: RuleWorld("gecko", device=device, particle_count=COUNT)
 
 
-def brush(tool, **fields):
-    return {"type": "brush", "tool": tool, "at": [0.0, 0.0], "radius": 0.1} | fields
+def brush(name, **fields):
+    return {"type": "brush", "tool": name, "at": [0.0, 0.0], "radius": 0.1} | fields
 
 
 def put(world, **settings):
@@ -193,7 +193,7 @@ def test_a_world_that_divides_shows_its_living_particles(tmp_path, device):
     rule, path = with_division(load_rule("gecko")), tmp_path / "dividing.safetensors"
     world = world_of(rule, path, device, division=True, particle_count=64)
     assert len(world.frame().positions) == 1
-    names = [tool["name"] for tool in world.describe()["tools"]]
+    names = [brush["name"] for brush in world.describe()["tools"]]
     assert names == ["remove", "push", "clump", "cut"]
     put(world, speed=8)
     for show in ("colours", "mask", "speed", "density", "components", "species", "state 3"):
@@ -208,7 +208,7 @@ def test_a_world_that_divides_shows_its_living_particles(tmp_path, device):
     world.advance()
     assert world.particles.x.shape == (1, 64, 2)
     assert len(world.frame().positions) == 0
-    with pytest.raises(NPAError, match="unknown tool 'graft'"):
+    with pytest.raises(NPAError, match="unknown brush 'graft'"):
         world.handle(brush("graft", rule="gecko"))
 
 
@@ -284,8 +284,8 @@ def test_every_field_of_particles_lives_through_steps_brushes_and_damage(world):
     world.handle(brush("add", rule="heart", at=[30.0, 0.0]))
     added = world.particles.path_length.shape[1] - COUNT
     assert added == world.particles.x.shape[1] - COUNT > 0
-    for tool in ("push", "clump", "cut", "inject"):
-        world.handle(brush(tool))
+    for name in ("push", "clump", "cut", "inject"):
+        world.handle(brush(name))
     world.advance()
     world.handle(brush("remove", at=[30.0, 0.0], radius=1.0))
     assert torch.equal(world.particles.path_length[:, order], velocity)
@@ -354,8 +354,8 @@ def test_the_loss_is_computed_only_where_it_is_wanted(world, monkeypatch):
         ({"type": "set", "name": "show", "value": "state 16"}, "unknown show 'state 16'"),
         ({"type": "damage", "name": "burn"}, "unknown damage 'burn'"),
         ({"type": "damage", "name": []}, "unknown damage"),
-        (brush("paint"), "unknown tool 'paint'"),
-        (brush(["remove"]), "unknown tool"),
+        (brush("paint"), "unknown brush 'paint'"),
+        (brush(["remove"]), "unknown brush"),
         (brush("remove", at=[0.0]), "at must be 2 finite numbers, got"),
         (brush("remove", at=[0.0, float("inf")]), "at must be 2 finite numbers"),
         (brush("remove", at="00"), "at must be 2 finite numbers"),
@@ -688,7 +688,7 @@ def test_hands_reach_into_environments(episodes):
     episodes.particles = particles
     episodes.handle(brush("inject", source=[0.1, 0.0], radius=0.2, strength=1.0))
     assert not torch.equal(episodes.particles.s, particles.s)
-    with pytest.raises(NPAError, match="unknown tool 'remove'"):
+    with pytest.raises(NPAError, match="unknown brush 'remove'"):
         episodes.handle(brush("remove"))
     put(episodes, loss=True)
     assert episodes.frame().loss == pytest.approx(episodes._info["loss"])

@@ -64,8 +64,6 @@ const [BLOCK, LOOP, IF, END, BR, BR_IF, NO_RESULT] = [0x02, 0x03, 0x04, 0x0b, 0x
 
 const zeros = v128.const(new Array(16).fill(0));
 
-const when = (condition, body) => [...condition, IF, NO_RESULT, ...body, END];
-
 // Repeats a body while a local is below a limit; tests before the first time.
 function loopBelow(local, limit, body) {
   const leave = [...i32.eqz(i32.lt_u(local.get, limit)), BR_IF, 1];
@@ -136,8 +134,7 @@ function listNeighboursCode(dimension) {
   const [stateAt, smoothing] = parameters(2), slopes = parameters(3), [out] = parameters(1);
   const [byte, end, count, hits, at] = integers(5);
   const [lanes] = vectors(1), d = vectors(3), [squared, inside, left, distance, factor, front] = vectors(6);
-  // The upper triangle, row by row.
-  const moment = [vectors(3), vectors(2), vectors(1)];
+  const moment = [vectors(3), vectors(2), vectors(1)]; // the upper triangle, row by row
   const scaled = vectors(3), constants = vectors(SCALARS), [eps, square, weight, slope] = constants.slice(3);
   const [own, sides, perSide] = [0, 7, 10].map((first) => constants.slice(first, first + 3));
   const axes = [0, 1, 2].slice(0, dimension);
@@ -172,7 +169,7 @@ function listNeighboursCode(dimension) {
     ...squared.set(axes.map((a) => f32x4.mul(d[a].get, d[a].get)).reduce((sum, term) => f32x4.add(sum, term))),
     ...inside.set(v128.and(f32x4.lt(squared.get, square.get), i32x4.lt_s(lanes.get, i32x4.splat(end.get)))),
     ...hits.set(i32x4.bitmask(inside.get)),
-    ...when(hits.get, appendFour),
+    ...hits.get, IF, NO_RESULT, ...appendFour, END,
     ...byte.set(i32.add(byte.get, i32.const(16))),
     ...lanes.set(i32x4.add(lanes.get, i32x4.splat(i32.const(4)))),
   ];
