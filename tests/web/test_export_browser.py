@@ -115,11 +115,7 @@ def test_solid_and_still_worlds_live_in_a_page(exported, name):
 
 
 # A GPU in software: slow, but the shaders are those that any GPU runs.
-FLAGS = (
-    "--enable-unsafe-webgpu",
-    "--use-webgpu-adapter=swiftshader",
-    "--enable-features=Vulkan",
-)
+FLAGS = ("--enable-unsafe-webgpu", "--use-webgpu-adapter=swiftshader", "--enable-features=Vulkan")
 
 ENGINE_STEP = """(async (engine, { rules, x, s, species, mask, eps, box, densityCounts }) => {
   const floats = (text) =>
@@ -133,9 +129,8 @@ ENGINE_STEP = """(async (engine, { rules, x, s, species, mask, eps, box, density
     const named = Object.entries(rule.weights).map(([name, text]) => [name, floats(text)]);
     return prepareRule({ ...rule, weights: Object.fromEntries(named) }, kernels);
   });
-  const world = {
-    count: species.length, x: floats(x), s: floats(s), species: Uint8Array.from(species),
-  };
+  const world = { count: species.length, x: floats(x), s: floats(s) };
+  world.species = Uint8Array.from(species);
   let physics = new Physics(prepared, world.count, kernels);
   if (engine === "gpu") physics = await GpuPhysics.make(await openDevice(), physics);
   await physics.step(world, { eps, box, densityCounts, mask: Uint8Array.from(mask) });

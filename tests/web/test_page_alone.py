@@ -118,12 +118,10 @@ def test_a_recording_ends_by_its_button_or_the_engine_and_not_by_the_film_before
 @pytest.mark.parametrize(
     ("low", "high", "scale"),
     [
-        (0.4 * 0.1, 0.25, "log"),
-        (0.4 * 0.0667, 2.5 * 0.0667, "log"),
-        (0.05, 1.0, None),
-        (0.0, 0.2 * 0.0333333, None),
+        (0.4 * 0.1, 0.25, "log"), (0.4 * 0.0667, 2.5 * 0.0667, "log"),
+        (0.05, 1.0, None), (0.0, 0.2 * 0.0333333, None),
     ],
-)
+)  # fmt: skip
 def test_the_ends_of_a_slider_lie_within_its_range(run, low, high, scale):
     setting = json.dumps({"value": high, "low": low, "high": high, "scale": scale})
     first, last = run(f"""

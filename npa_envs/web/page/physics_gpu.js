@@ -174,8 +174,7 @@ export class GpuPhysics {
   static async make(device, physics) {
     for (const kind of ["out-of-memory", "validation"]) device.pushErrorScope(kind);
     const gpu = new GpuPhysics(device, physics);
-    const errors = [await device.popErrorScope(), await device.popErrorScope()];
-    const error = errors.find((entry) => entry !== null);
+    const error = [await device.popErrorScope(), await device.popErrorScope()].find((entry) => entry !== null);
     if (error) throw Error(error.message);
     return gpu;
   }
