@@ -19,17 +19,25 @@ from torch import Tensor
 
 from npa_envs.atomic_files import atomic_path, checked_path
 from npa_envs.errors import NPAError, shown
+from npa_envs.render.colours import STATE_GAIN
 from npa_envs.rule.files import load_rule, rule_name
-from npa_envs.rule.rule import NPARule, check_rule
+from npa_envs.rule.rule import COLOUR_OFFSET, NPARule, check_rule
 from npa_envs.tasks.damage import CLUMP_FACTOR, DAMAGE_SIZES
 from npa_envs.tasks.point_classification import PALETTE, UNDECIDED, PointClassification
-from npa_envs.web.live_world import colour_tables
+from npa_envs.web.live_world import BALANCE, colour_tables
 from npa_envs.web.messages import SEEDS
 from npa_envs.web.rule_world import MIN_SEED, RuleWorld
 from npa_envs.world.species import AGREEMENTS
 
 PAGE = Path(__file__).resolve().parent / "page"
 """The folder of the page's files."""
+
+CONSTANTS = {
+    "AGREEMENTS": AGREEMENTS, "BALANCE": BALANCE, "CLUMP_FACTOR": CLUMP_FACTOR,
+    "COLOUR_OFFSET": COLOUR_OFFSET, "DAMAGE_SIZES": DAMAGE_SIZES, "MIN_SEED": MIN_SEED,
+    "STATE_GAIN": STATE_GAIN,
+}  # fmt: skip
+"""Python's constants that the page's modules read."""
 
 MAX_WEIGHTS = 2**20
 """Maximum number of weights of a page's rule: 5.6 MB of text, and very slow in a browser."""
@@ -40,16 +48,18 @@ POLICY = (
 )
 """The page's content security policy: it may load nothing."""
 
-IMPORT = re.compile(r'^import (\{[^}]*\}) from "\./([\w.]+)";', re.MULTILINE)
+IMPORT = re.compile(r'^import (\{\s*\w+(?:,\s*\w+)*,?\s*\}) from "\./([\w.]+)";$', re.MULTILINE)
 EXPORT = re.compile(r"^export (?=(?:async )?(?:function|class|const) (\w+))", re.MULTILINE)
-"""The only forms of imports and exports in the page's modules."""
+OTHER_FORM = re.compile(r"^(?:(?!//).)*\b(?:import|export)\b.*", re.MULTILINE)
+"""The only forms of imports and exports in the page's modules, and lines that have another form."""
 
 
 def joined_modules(name: str) -> str:
     """Return one script with a module of the page and all that it imports.
 
     Each module becomes a function that runs once, after those that it imports, so that its names
-    stay local. The script's constant `modules` has their exports by file name.
+    stay local. The script's constant `modules` has their exports by file name. Raises ValueError
+    for an import or export of another form than `IMPORT` and `EXPORT`.
     """
     functions: dict[str, str] = {}
 
@@ -60,6 +70,12 @@ def joined_modules(name: str) -> str:
                 add(imported)
         exports = ", ".join(EXPORT.findall(text))
         body = EXPORT.sub("", IMPORT.sub(r'const \1 = modules["\2"];', text))
+        if other := OTHER_FORM.search(body):
+            line = body.count("\n", 0, other.start()) + 1
+            raise ValueError(
+                "a page's modules may only import { names } from another one, and export a named "
+                f"function, class or const, got {shown(other[0])} in line {line} of {PAGE / name}"
+            )
         functions[name] = f'modules["{name}"] = (() => {{\n{body}return {{ {exports} }};\n}})();'
 
     add(name)
@@ -225,12 +241,7 @@ def page_text(
             name: base64.b64encode(table.tobytes()).decode()
             for name, table in colour_tables(len(rules)).items()
         },
-        "constants": {
-            "AGREEMENTS": AGREEMENTS,
-            "CLUMP_FACTOR": CLUMP_FACTOR,
-            "DAMAGE_SIZES": DAMAGE_SIZES,
-            "MIN_SEED": MIN_SEED,
-        },
+        "constants": CONSTANTS,
         "rules": rules,
     }
     # With "<" a rule's text could end the script element.

@@ -195,6 +195,9 @@ class LiveWorld(ABC):
 BALANCE = 0.9
 """Weight of earlier frames in the moving average of the covariance behind "components"."""
 
+MASK_COLOURS = ((0.29, 0.33, 0.42), (0.98, 0.78, 0.36))
+"""Colours of particles that the last step has not updated, and of those that it has."""
+
 
 class ColouredWorld(NamedTuple):
     """The values of a world from which `Colouring` computes colours."""
@@ -245,10 +248,8 @@ class Colouring:
                 speed = _or_zeros(world.travelled, world)
                 return _ramp(speed.clamp(0.0, 1.0).sqrt())
             case ["mask"]:
-                updated = _or_zeros(world.updated, world).bool()[:, None]
-                tints = ((0.98, 0.78, 0.36), (0.29, 0.33, 0.42))
-                on, off = (updated.new_tensor(tint, dtype=torch.float32) for tint in tints)
-                return _bytes(torch.where(updated, on, off))
+                tints = world.x.new_tensor(MASK_COLOURS, dtype=torch.float32)
+                return _bytes(tints[_or_zeros(world.updated, world).long()])
             case _:
                 channel = int(show.removeprefix("state "))
                 return _bytes(signed_colours(world.s[0, :, channel]))
@@ -310,12 +311,13 @@ def _or_zeros(values: Tensor | None, world: ColouredWorld) -> Tensor:
 def colour_tables(species_count: int) -> dict[str, NDArray[np.uint8]]:
     """Return the colours that colours.js reads, by name, each uint8, shape [K, 3].
 
-    "ramp" is `colour_ramp`, and "species" has a colour for each species. "state" has those of
-    `signed_colours` at equal steps of 1 / (1 + exp(-STATE_GAIN value)).
+    "ramp" is `colour_ramp`, "mask" are `MASK_COLOURS`, and "species" has a colour for each species.
+    "state" has those of `signed_colours` at equal steps of 1 / (1 + exp(-STATE_GAIN value)).
     """
     values = torch.logit(torch.linspace(0.0, 1.0, 1025)) / STATE_GAIN
     state = _bytes(signed_colours(values))
-    return {"ramp": colour_ramp(), "state": state, "species": species_colours(species_count)}
+    species, mask = species_colours(species_count), _bytes(torch.tensor(MASK_COLOURS))
+    return {"ramp": colour_ramp(), "state": state, "species": species, "mask": mask}
 
 
 def colour_ramp() -> NDArray[np.uint8]:

@@ -153,7 +153,7 @@ class BrushUse(NamedTuple):
         """
         name, at, space_dim = message.get("tool"), message.get("at"), x.shape[2]
         if not isinstance(name, str) or name not in brushes:
-            raise NPAError(f"unknown tool {shown(name)}: {suggest(name, brushes)}")
+            raise NPAError(f"unknown brush {shown(name)}: {suggest(name, brushes)}")
         strength = Range(0.0, 1.0).checked("strength", message.get("strength", 1.0))
         least, added = brushes[name].amounts
         return cls(

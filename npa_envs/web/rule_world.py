@@ -53,8 +53,8 @@ class LiveRule:
     """The rule in float32."""
     count: int = 0
     """Number of its particles."""
-    divisor: float = 0.0
-    """Number by which its densities are divided."""
+    density_count: float = 0.0
+    """Number of particles by which its densities are divided."""
 
 
 class RuleWorld(LiveWorld):
@@ -125,7 +125,7 @@ class RuleWorld(LiveWorld):
         self.particles, self._goal = seed_world._replace(goal=None), seed_world.goal
         self.count = self.particles.x.shape[1]
         """Particles of a newly seeded world."""
-        self.live_rules = [replace(self.main, count=self.count, divisor=float(self.count))]
+        self.live_rules = [replace(self.main, count=self.count, density_count=float(self.count))]
         self._colouring = Colouring()
         self._loss_due = 0.0
         self._resting, self._next_rest_check = False, REST_CHECK_STEPS
@@ -249,7 +249,7 @@ class RuleWorld(LiveWorld):
 
     def _is_unchanged(self) -> bool:
         """Return whether no brush has added or removed particles or rules."""
-        species = [(live_rule.count, live_rule.divisor) for live_rule in self.live_rules]
+        species = [(live_rule.count, live_rule.density_count) for live_rule in self.live_rules]
         return species == [(self.count, self.count)]
 
     def _rollout(self, steps: int, options: Mapping[str, Any]) -> Tensor:
@@ -262,10 +262,10 @@ class RuleWorld(LiveWorld):
         else:
             # Divided by the particles of a newly seeded world: those that a brush adds or removes
             # change only the densities around them.
-            divisors = [live_rule.divisor for live_rule in self.live_rules]
+            density_counts = [live_rule.density_count for live_rule in self.live_rules]
             after = species_particles(
-                rules, self.particles, steps, counts=self.counts, density_counts=divisors,
-                return_path_length=True, **options,
+                rules, self.particles, steps, counts=self.counts,
+                density_counts=density_counts, return_path_length=True, **options,
             )  # fmt: skip
         assert after.path_length is not None, "it is asked for"
         self.particles = after._replace(path_length=self.particles.path_length)
@@ -367,8 +367,8 @@ class RuleWorld(LiveWorld):
         task = self.task if is_main else self._trained(live_rule.name, None).task
         return task.with_target_code(s)
 
-    def _species_index(self, name: Any, divisor: float) -> int:
-        """Return a rule's index in `live_rules`; a new rule is appended, with this divisor."""
+    def _species_index(self, name: Any, density_count: float) -> int:
+        """Return a rule's index in `live_rules`; append a new rule, which has `density_count`."""
         live_rule = self._live_rule(name)
         if not self._may_join(name):
             raise NPAError(
@@ -378,7 +378,7 @@ class RuleWorld(LiveWorld):
         names = [present.name for present in self.live_rules]
         if name not in names:
             names.append(name)
-            self.live_rules.append(replace(live_rule, divisor=divisor))
+            self.live_rules.append(replace(live_rule, density_count=density_count))
         return names.index(name)
 
     def _species(self) -> Tensor:
@@ -447,7 +447,7 @@ class RunWorld(RuleWorld):
             world.x[..., 0] += centre
             worlds.append(world._replace(goal=None))
             # As in training, each species divides densities by its own number of particles.
-            live_rule.count = live_rule.divisor = world.x.shape[1]
+            live_rule.count = live_rule.density_count = world.x.shape[1]
         self.particles = together(worlds)
         self.count = sum(self.counts)
 

@@ -77,7 +77,7 @@ SPECIES: dict[str, Sequence[int] | None] = {
     "two species": None,
     "two species, each divided by its own number": (200, 100),
 }
-"""Worlds of a gecko and another rule: the divisors of densities."""
+"""Worlds of a gecko and another rule: the numbers by which densities are divided."""
 
 
 class Example(NamedTuple):

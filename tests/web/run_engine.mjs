@@ -32,8 +32,8 @@ const acts = {
   },
 
   // Principal components of states, frame after frame.
-  components({ channels, frames }) {
-    const colouring = new Colouring({});
+  components({ channels, frames, constants }) {
+    const colouring = new Colouring({}, constants);
     return frames.map((s) => {
       const bytes = new Uint8ClampedArray((3 * floats(s).length) / channels);
       colouring.components(floats(s), channels, bytes);

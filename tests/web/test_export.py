@@ -20,7 +20,7 @@ from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.damage import DAMAGE_SIZES
 from npa_envs.tasks.point_classification import class_colours
 from npa_envs.web import messages
-from npa_envs.web.export import check_browser_rule, export_web, page_rule, page_text
+from npa_envs.web.export import check_browser_rule, export_web, joined_modules, page_rule, page_text
 from npa_envs.web.live_world import ColouredWorld, Colouring
 from npa_envs.web.rule_world import RuleWorld
 from npa_envs.world.brushes import nearest_image
@@ -198,8 +198,7 @@ def test_settings_reach_the_world_and_wrong_messages_are_reported(run, settings)
     whole = live(run, settings, *[ADVANCE] * 3)
     x = unpacked(whole["x"], (300, 2))
     farthest_moves = {"wipe": 0.0, "cut": 0.05, "clump": 0.18, "noise": 0.25}
-    for name in DAMAGE_SIZES:
-        farthest = farthest_moves[name]
+    for name, farthest in {name: farthest_moves[name] for name in DAMAGE_SIZES}.items():
         damaged = live(run, settings, *[ADVANCE] * 3, {"type": "damage", "name": name})
         moved = (unpacked(damaged["x"], (300, 2)) - x).norm(dim=-1).max()
         assert 0.5 * farthest <= float(moved) <= farthest + 1e-6
@@ -245,13 +244,14 @@ def test_particles_have_the_colours_of_the_viewer(run, settings, show):
     assert len(want.unique(dim=0)) > (0 if show == "species" else 1)
 
 
-def test_particles_that_are_no_number_leave_the_components_of_the_others_alone(run):
+def test_particles_that_are_no_number_leave_the_components_of_the_others_alone(run, settings):
     s = torch.randn(40, 4, generator=torch.Generator().manual_seed(2))
     broken = torch.cat((s, s[:2]))
     broken[40, 1], broken[41, 0] = float("nan"), float("inf")
     frames = [packed(states) for states in (broken, torch.full_like(s, float("nan")), s)]
-    first, _, last_one = run("components", channels=4, frames=frames)
-    assert first[:120] == run("components", channels=4, frames=frames[2:])[0]
+    options = {"channels": 4, "constants": settings["constants"]}
+    first, _, last_one = run("components", frames=frames, **options)
+    assert first[:120] == run("components", frames=frames[2:], **options)[0]
     assert len(set(last_one)) > 20
 
 
@@ -302,6 +302,23 @@ def test_a_page_is_one_small_file_that_asks_for_nothing(tmp_path):
     assert "<script>alert(1)" not in text
     assert "<b>" not in text
     assert '"name":"\\u003cb>"' in text
+
+
+def test_an_import_or_export_of_another_form_is_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr("npa_envs.web.export.PAGE", tmp_path)
+    (tmp_path / "b.js").write_text("// To import and export.\nexport const b = 2;\n")
+    known = 'import {\n  b,\n} from "./b.js";\nexport const a = b; // export it\n'
+    (tmp_path / "a.js").write_text(known)
+    assert 'modules["a.js"] = (() => {\nconst {\n  b,\n} = modules[' in joined_modules("a.js")
+    for line in (
+        *(f'import {names} from "./b.js";' for names in ("c", "* as c", "{ b as c }")),
+        'import "./b.js";', 'await import("./b.js");', 'import { b } from "./b.js"',
+        *(f"export {form};" for form in ("{ b }", "default 1", "let c = 1", "function* c() {}")),
+        "  export const c = 1;",
+    ):  # fmt: skip
+        (tmp_path / "a.js").write_text(f"{known}{line}\n")
+        with pytest.raises(ValueError, match=r"in line 5 of .*a\.js"):
+            joined_modules("a.js")
 
 
 class OwnNetwork(NPARule):

@@ -115,29 +115,25 @@ def test_solid_and_still_worlds_live_in_a_page(exported, name):
 
 
 # A GPU in software: slow, but the shaders are those that any GPU runs.
-FLAGS = (
-    "--enable-unsafe-webgpu",
-    "--use-webgpu-adapter=swiftshader",
-    "--enable-features=Vulkan",
-)
+FLAGS = ("--enable-unsafe-webgpu", "--use-webgpu-adapter=swiftshader", "--enable-features=Vulkan")
 
-GPU_STEP = """(async ({ rules, x, s, species, mask, eps, box, densityCounts }) => {
+ENGINE_STEP = """(async (engine, { rules, x, s, species, mask, eps, box, densityCounts }) => {
   const floats = (text) =>
     new Float32Array(Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0)).buffer);
-  const { Physics, plainKernels, prepareRule } = modules["physics.js"];
+  const { Physics, padded, plainKernels, prepareRule } = modules["physics.js"];
+  const { simdKernels } = modules["kernels_simd.js"];
   const { GpuPhysics, openDevice } = modules["physics_gpu.js"];
-  const kernels = plainKernels();
+  const { state_dim, space_dim } = rules[0];
+  const kernels = engine === "simd" ? simdKernels(padded(state_dim), space_dim) : plainKernels();
   const prepared = rules.map((rule) => {
     const named = Object.entries(rule.weights).map(([name, text]) => [name, floats(text)]);
     return prepareRule({ ...rule, weights: Object.fromEntries(named) }, kernels);
   });
-  const world = {
-    count: species.length, x: floats(x), s: floats(s), species: Uint8Array.from(species),
-  };
-  const device = await openDevice();
-  const gpu = await GpuPhysics.make(
-    device, new Physics(prepared, world.count, kernels));
-  await gpu.step(world, { eps, box, densityCounts, mask: Uint8Array.from(mask) });
+  const world = { count: species.length, x: floats(x), s: floats(s) };
+  world.species = Uint8Array.from(species);
+  let physics = new Physics(prepared, world.count, kernels);
+  if (engine === "gpu") physics = await GpuPhysics.make(await openDevice(), physics);
+  await physics.step(world, { eps, box, densityCounts, mask: Uint8Array.from(mask) });
   return { x: [...world.x], s: [...world.s] };
 })"""
 
@@ -150,16 +146,17 @@ def gpu_page(tmp_path_factory):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", [*WORLDS, *SPECIES])
-def test_a_step_on_a_gpu_is_that_of_python(tmp_path, gpu_page, kind):
-    text = f"<!doctype html><script>{joined_modules('physics_gpu.js')}</script>"
-    (tmp_path / "gpu.html").write_text(text, encoding="utf-8")
+def test_a_step_of_each_engine_is_that_of_python(tmp_path, gpu_page, kind):
+    text = f"<!doctype html><script>{joined_modules('rule_world.js')}</script>"
+    (tmp_path / "engines.html").write_text(text, encoding="utf-8")
     page = gpu_page()
-    page.open((tmp_path / "gpu.html").as_uri())
+    page.open((tmp_path / "engines.html").as_uri())
     page.wait("typeof modules === 'object'")
     step = example(kind)
-    got = page.run(f"{GPU_STEP}({json.dumps(step.fields)})")
-    for name, want in zip("xs", step.after, strict=True):
-        assert float((torch.tensor(got[name]).view_as(want) - want).abs().max()) < TOLERANCE
+    for engine in ("plain", "simd", "gpu"):
+        got = page.run(f"{ENGINE_STEP}('{engine}', {json.dumps(step.fields)})")
+        for name, want in zip("xs", step.after, strict=True):
+            assert float((torch.tensor(got[name]).view_as(want) - want).abs().max()) < TOLERANCE
     assert page.complaints == []
 
 

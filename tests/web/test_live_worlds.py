@@ -36,8 +36,8 @@ def gecko(device):
     return lambda: RuleWorld("gecko", device=device, particle_count=COUNT)
 
 
-def brush(tool, **fields):
-    return {"type": "brush", "tool": tool, "at": [0.0, 0.0], "radius": 0.1} | fields
+def brush(name, **fields):
+    return {"type": "brush", "tool": name, "at": [0.0, 0.0], "radius": 0.1} | fields
 
 
 def put(world, **settings):
@@ -68,16 +68,14 @@ def world(gecko) -> RuleWorld:
 
 def test_a_live_world_is_the_rollout_of_its_rule(world):
     put(world, speed=3)
-    device = world.particles.x.device
+    task, device = world.task, world.particles.x.device
     rule = load_rule("gecko", device=device).float()
     generator = torch.Generator(device).manual_seed(0)
-    x, s, *_ = world.task.seed(1, generator=generator, device=device)
+    x, s, *_ = task.seed(1, generator=generator, device=device)
     advance(world, 2)
     with torch.no_grad():
-        x, s = rollout(
-            rule, x, s, 6, eps=world.task.eps, update_prob=world.task.update_prob,
-            generator=generator,
-        )  # fmt: skip
+        settings = {"eps": task.eps, "update_prob": task.update_prob, "generator": generator}
+        x, s = rollout(rule, x, s, 6, **settings)
     frame = world.frame()
     assert frame.step == 6
     assert frame.milliseconds > 0.0
@@ -193,7 +191,7 @@ def test_a_world_that_divides_shows_its_living_particles(tmp_path, device):
     rule, path = with_division(load_rule("gecko")), tmp_path / "dividing.safetensors"
     world = world_of(rule, path, device, division=True, particle_count=64)
     assert len(world.frame().positions) == 1
-    names = [tool["name"] for tool in world.describe()["tools"]]
+    names = [brush["name"] for brush in world.describe()["tools"]]
     assert names == ["remove", "push", "clump", "cut"]
     put(world, speed=8)
     for show in ("colours", "mask", "speed", "density", "components", "species", "state 3"):
@@ -208,7 +206,7 @@ def test_a_world_that_divides_shows_its_living_particles(tmp_path, device):
     world.advance()
     assert world.particles.x.shape == (1, 64, 2)
     assert len(world.frame().positions) == 0
-    with pytest.raises(NPAError, match="unknown tool 'graft'"):
+    with pytest.raises(NPAError, match="unknown brush 'graft'"):
         world.handle(brush("graft", rule="gecko"))
 
 
@@ -284,8 +282,8 @@ def test_every_field_of_particles_lives_through_steps_brushes_and_damage(world):
     world.handle(brush("add", rule="heart", at=[30.0, 0.0]))
     added = world.particles.path_length.shape[1] - COUNT
     assert added == world.particles.x.shape[1] - COUNT > 0
-    for tool in ("push", "clump", "cut", "inject"):
-        world.handle(brush(tool))
+    for name in ("push", "clump", "cut", "inject"):
+        world.handle(brush(name))
     world.advance()
     world.handle(brush("remove", at=[30.0, 0.0], radius=1.0))
     assert torch.equal(world.particles.path_length[:, order], velocity)
@@ -314,9 +312,8 @@ def test_another_rule_is_another_world(world):
     put(world, show="state 15")
     assert put(world, rule="dots")
     description = world.describe()
-    assert description["rule"] == "dots"
-    assert description["box"] == [2.0, 2.0]
-    assert description["half_width"] == 1.0
+    expected = {"rule": "dots", "box": [2.0, 2.0], "half_width": 1.0}
+    assert description == description | expected
     assert "dots" in description["others"]
     assert "gecko" not in description["others"]
     with pytest.raises(NPAError, match="gecko cannot live in a world of dots"):
@@ -337,8 +334,7 @@ def test_the_loss_is_computed_only_where_it_is_wanted(world, monkeypatch):
 @pytest.mark.parametrize(
     ("message", "error"),
     [
-        ({}, "unknown message None"),
-        ([], "unknown message None"),
+        ({}, "unknown message None"), ([], "unknown message None"),
         ({"type": "fly"}, "unknown message 'fly'"),
         ({"type": "reset", "seed": -1}, r"seed must be a whole number in \[0, 9"),
         ({"type": "reset", "seed": 0.5}, "seed must be a whole number"),
@@ -354,8 +350,7 @@ def test_the_loss_is_computed_only_where_it_is_wanted(world, monkeypatch):
         ({"type": "set", "name": "show", "value": "state 16"}, "unknown show 'state 16'"),
         ({"type": "damage", "name": "burn"}, "unknown damage 'burn'"),
         ({"type": "damage", "name": []}, "unknown damage"),
-        (brush("paint"), "unknown tool 'paint'"),
-        (brush(["remove"]), "unknown tool"),
+        (brush("paint"), "unknown brush 'paint'"), (brush(["remove"]), "unknown brush"),
         (brush("remove", at=[0.0]), "at must be 2 finite numbers, got"),
         (brush("remove", at=[0.0, float("inf")]), "at must be 2 finite numbers"),
         (brush("remove", at="00"), "at must be 2 finite numbers"),
@@ -366,7 +361,7 @@ def test_the_loss_is_computed_only_where_it_is_wanted(world, monkeypatch):
         (brush("graft", rule="worm"), "unknown rule 'worm'"),
         (brush("graft", rule="duck"), "duck cannot live in a world of gecko"),
     ],
-)
+)  # fmt: skip
 def test_a_wrong_message_is_rejected_and_changes_nothing(shared, message, error):
     particles, description = shared.particles, shared.describe()
     with pytest.raises(NPAError, match=error):
@@ -520,8 +515,7 @@ def test_a_run_of_several_rules_is_one_world_of_them(tmp_path):
     shutil.copytree(UNFINISHED, folder)
     world = RunWorld(folder, device=CPU)
     description = world.describe()
-    assert description["title"] == "pair"
-    assert description["species"] == ["rule-0", "rule-1"]
+    assert (description["title"], description["species"]) == ("pair", ["rule-0", "rule-1"])
     assert world.counts == [128, 128]
     curve, _ = world.take_events()
     assert len(curve["points"]) > 1
@@ -661,8 +655,7 @@ def episodes():
 
 def test_episodes_follow_each_other(episodes):
     first = episodes.frame().positions.copy()
-    for _ in range(2):
-        episodes.advance()
+    advance(episodes, 2)
     assert episodes.frame().step == 2
     assert episodes.take_events() == []
     episodes.advance()
@@ -688,7 +681,7 @@ def test_hands_reach_into_environments(episodes):
     episodes.particles = particles
     episodes.handle(brush("inject", source=[0.1, 0.0], radius=0.2, strength=1.0))
     assert not torch.equal(episodes.particles.s, particles.s)
-    with pytest.raises(NPAError, match="unknown tool 'remove'"):
+    with pytest.raises(NPAError, match="unknown brush 'remove'"):
         episodes.handle(brush("remove"))
     put(episodes, loss=True)
     assert episodes.frame().loss == pytest.approx(episodes._info["loss"])

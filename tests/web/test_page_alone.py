@@ -11,7 +11,7 @@ import pytest
 
 from npa_envs.web.messages import BRUSHES
 
-SENT_TOOLS = [{"name": name} | brush._asdict() for name, brush in BRUSHES.items()]
+SENT_BRUSHES = [{"name": name} | brush._asdict() for name, brush in BRUSHES.items()]
 SETUP = """
 const world = { type: "world", title: "t", dimension: 2, tools, capabilities: ["film"] };
 const frame = (step, places = [0, 0, 1, 1]) => ({
@@ -31,7 +31,7 @@ def run(modules):
 
     def script(text):
         program = str(Path(__file__).with_name("run_page.mjs"))
-        tools = f"const tools = {json.dumps(SENT_TOOLS)};"
+        tools = f"const tools = {json.dumps(SENT_BRUSHES)};"
         command = ["node", program, str(modules), tools + SETUP + text]
         output = subprocess.check_output(command, text=True, timeout=300, encoding="utf-8")
         return json.loads(output)
@@ -59,16 +59,16 @@ def test_each_brush_sends_its_messages_at_its_time(run):
     strokes = run("""
         const strokes = {};
         for (const { name } of tools) {
-          page.tools.choose(name);
+          page.brushes.choose(name);
           sent.length = 0;
           const event = (type, clientX) =>
             ({ type, clientX, clientY: 40, pointerId: 1, button: 0, pointerType: "mouse" });
-          page.tools.press(event("pointerdown", 40));
+          page.brushes.press(event("pointerdown", 40));
           tick();
-          page.tools.move(event("pointermove", 60));
+          page.brushes.move(event("pointermove", 60));
           tick();
           tick();
-          page.tools.release(event("pointerup", 60));
+          page.brushes.release(event("pointerup", 60));
           strokes[name] = ofType("brush").map(({ at, move, source }) =>
             [at[0], move[0], source?.[0] ?? null].map((x) => x && Math.round(x / 0.275)));
         }
@@ -118,12 +118,10 @@ def test_a_recording_ends_by_its_button_or_the_engine_and_not_by_the_film_before
 @pytest.mark.parametrize(
     ("low", "high", "scale"),
     [
-        (0.4 * 0.1, 0.25, "log"),
-        (0.4 * 0.0667, 2.5 * 0.0667, "log"),
-        (0.05, 1.0, None),
-        (0.0, 0.2 * 0.0333333, None),
+        (0.4 * 0.1, 0.25, "log"), (0.4 * 0.0667, 2.5 * 0.0667, "log"),
+        (0.05, 1.0, None), (0.0, 0.2 * 0.0333333, None),
     ],
-)
+)  # fmt: skip
 def test_the_ends_of_a_slider_lie_within_its_range(run, low, high, scale):
     setting = json.dumps({"value": high, "low": low, "high": high, "scale": scale})
     first, last = run(f"""

@@ -62,8 +62,7 @@ def test_environments_of_ones_own_are_viewed(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("words", "error"),
     [
-        (["worm"], "unknown rule 'worm'"),
-        (["npa/Worm-v0"], "unknown environment 'npa/Worm-v0'"),
+        (["worm"], "unknown rule 'worm'"), (["npa/Worm-v0"], "unknown environment 'npa/Worm-v0'"),
         (["no_module:Worm-v0"], "unknown environment 'no_module:Worm-v0'"),
         (["CartPole-v1"], "env must be an environment of npa_envs, got 'CartPole-v1'"),
         (["npa/Texture-v0", "--policy", "duck"], "the environment's space_dim, 2, got 3"),
@@ -78,17 +77,15 @@ def test_environments_of_ones_own_are_viewed(tmp_path, monkeypatch):
         (["npa/Texture-v0", "--keywords", "output=numpy"], "must leave output to the command"),
         (["npa/Texture-v0", "--keywords", "id=x"], "must leave id to the command"),
         (["npa/Texture-v0", "--keywords", "disable_env_checker=true"], "to the command"),
-        (
-            ["npa/Texture-v0", "--keywords", "max_episode_steps=abc"],
-            "max_episode_steps must be a whole number of at least 1, got 'abc'",
-        ),
+        (["npa/Texture-v0", "--keywords", "max_episode_steps=abc"],
+         "max_episode_steps must be a whole number of at least 1, got 'abc'"),
         (["npa/Texture-v0", "--keywords", "max_episode_steps=0"], "at least 1, got 0"),
         (["gecko", "--threads", "0"], "threads must be in [1, 256], got 0"),
         (["gecko", "--port", "-1"], "port must be in [0, 65535], got -1"),
         (["gecko", "--device", "tpu"], "device must name a device"),
         (["gecko", "--seed", "-1"], "seed must be a whole number"),
     ],
-)
+)  # fmt: skip
 def test_what_is_wrong_is_said_before_anything_is_served(words, error, capsys, tmp_path):
     port = [] if "--port" in words else ["--port", "0"]
     assert main(["view", *words, "--no-browser", *port, "--out", str(tmp_path)]) == 2

@@ -68,8 +68,8 @@ def pause(page) -> None:
     page.wait("!document.page.world.playing")
 
 
-def take(page, tool: str) -> None:
-    page.run(f"document.querySelector('[data-tool={tool}]').click()")
+def take(page, brush: str) -> None:
+    page.run(f"document.querySelector('[data-brush={brush}]').click()")
 
 
 def positions(page) -> np.ndarray:
@@ -128,11 +128,11 @@ def test_the_world_moves_the_brush_removes_and_a_slider_changes_eps(shown, tmp_p
 
 
 @pytest.mark.slow
-def test_every_tool_and_every_show_works(shown):
+def test_every_brush_and_every_show_works(shown):
     page, _ = shown(count=512)
     page.wait(f"{FRAME}.step > 20")
-    for tool in ("push", "clump", "cut", "inject", "graft", "add"):
-        take(page, tool)
+    for brush in ("push", "clump", "cut", "inject", "graft", "add"):
+        take(page, brush)
         page.drag([pixel_of(page, x, 0.0) for x in (-0.2, -0.1, 0.0, 0.1, 0.2)])
         time.sleep(0.3)
     page.wait("document.page.world.species.length === 2")
@@ -182,8 +182,7 @@ def test_on_a_phone_fingers_brush_and_the_settings_fold(shown):
     page, _ = shown(size=PHONE, light=True)
     assert page.run("document.page.background.map((c) => Math.round(255 * c))") == [247, 246, 242]
     assert page.run("document.getElementById('panel').hidden")
-    width = page.run("document.documentElement.scrollWidth")
-    assert width == PHONE[0]
+    assert page.run("document.documentElement.scrollWidth") == PHONE[0]
     for left, right, bottom, size in page.run(
         "[...document.querySelectorAll('.bar button')].map((b) => { "
         "const r = b.getBoundingClientRect(); return [r.left, r.right, r.bottom, r.width]; })"
@@ -201,7 +200,7 @@ def test_on_a_phone_fingers_brush_and_the_settings_fold(shown):
 @pytest.mark.parametrize("painter", ["canvas", "webgl2"])
 def test_a_3d_world_turns_under_the_pointer(shown, painter, tmp_path):
     page, _ = shown("duck", 1024, query=f"?painter={painter}")
-    assert page.run("document.page.tools.chosen.name") == "look"
+    assert page.run("document.page.brushes.chosen.name") == "look"
     page.drag([(400, 400), (450, 400), (500, 400)])
     assert page.run("document.page.camera.azimuth") == pytest.approx(-40.0)
     take(page, "remove")

@@ -1,4 +1,4 @@
-// Brushes, by the formulas of npa_envs/world/brushes.py, in place: a change there is made here as well.
+// Brushes, by the formulas of npa_envs/world/brushes.py, in place; a test that rule_world.js names compares both.
 //
 // world: {x, s, dimension, channels, box}. x: positions [length units], s: states, particle by particle;
 // box: sides of the periodic box [length units], in which distances are those to the nearest image, or null.
@@ -92,6 +92,14 @@ export function cut(world, centre, normal, gap, along = null) {
     if (along !== null && Math.abs(inner(offset, along)) > half) return;
     for (let d = 0; d < dimension; d++) x[i * dimension + d] += shift * direction[d];
   });
+}
+
+// Opens a gap along the movement `move` from `start`, as seen from direction `view`.
+export function cutAlong(world, start, move, gap, view) {
+  const half = move.map((component) => component / 2);
+  const [x, y, z = 0] = move, [a, b, c] = view;
+  const normal = [b * z - c * y, c * x - a * z, a * y - b * x].slice(0, world.dimension);
+  cut(world, start.map((coordinate, d) => coordinate + half[d]), normal, gap, half);
 }
 
 // Returns the scalar product.

@@ -1,30 +1,24 @@
 // Colours of particles by state, density, species, speed or update mask, by the formulas of `Colouring` of
-// npa_envs/web/live_world.py: a change there is made here as well.
+// npa_envs/web/live_world.py; test_particles_have_the_colours_of_the_viewer of tests/web/test_export.py compares all.
 
 import { inner } from "./brushes.js";
-
-// As in npa_envs/rule/rule.py, npa_envs/render/colours.py and npa_envs/web/live_world.py.
-const COLOUR_OFFSET = 0.5;
-const STATE_GAIN = 2.8;
-const BALANCE = 0.9;
-const UPDATED = [0.98, 0.78, 0.36];
-const RESTING = [0.29, 0.33, 0.42];
 
 const ROWS_TOGETHER = 64;
 const JACOBI_SWEEPS = 12;
 
 // Computes red, green and blue bytes of each particle, frame by frame.
 export class Colouring {
-  // tables: those of `colour_tables` of npa_envs/web/live_world.py, each a Uint8Array of red, green and blue.
-  constructor(tables) {
+  // tables: `colour_tables` of npa_envs/web/live_world.py, as Uint8Array; constants: `CONSTANTS` of export.py there.
+  constructor(tables, constants) {
     this.tables = tables;
+    this.constants = constants;
     this.average = null; // moving average of the states' covariance
     this.basis = null;
   }
 
   // live: the RuleWorld; show: one of its shows.
   of(live, show) {
-    const { world } = live, { ramp, state, species } = this.tables;
+    const { world } = live, { ramp, state, species, mask } = this.tables;
     const bytes = new Uint8ClampedArray(3 * world.count);
     if (show === "colours") {
       live.ruleColours.forEach((colours, number) => colours.write(world, number, bytes));
@@ -37,10 +31,10 @@ export class Colouring {
     } else if (show === "speed") {
       writeColours(bytes, (i) => between(ramp, Math.sqrt(live.travelled[i] || 0)));
     } else if (show === "mask") {
-      writeColours(bytes, (i) => (live.updated[i] ? UPDATED : RESTING));
+      writeColours(bytes, (i) => entryOf(mask, live.updated[i]));
     } else {
-      const channel = Number(show.slice("state ".length));
-      writeColours(bytes, (i) => between(state, 1 / (1 + Math.exp(-STATE_GAIN * world.s[i * live.channels + channel]))));
+      const channel = Number(show.slice("state ".length)), gain = this.constants.STATE_GAIN;
+      writeColours(bytes, (i) => between(state, 1 / (1 + Math.exp(-gain * world.s[i * live.channels + channel]))));
     }
     return new Uint8Array(bytes.buffer);
   }
@@ -78,6 +72,7 @@ export class Colouring {
       this.average = covariance.slice();
       this.basis = null;
     }
+    const { BALANCE } = this.constants;
     this.average = this.average.map((average, k) => BALANCE * average + (1 - BALANCE) * covariance[k]);
     const components = eigenvectors(this.average, channels).slice(0, 3);
     components.forEach(({ vector }, k) => {
@@ -109,9 +104,10 @@ function entryOf(table, index) {
 // Colours of one rule's particles by the outputs of its read-out, or their states: the last three, or the
 // colour of the class with the largest output, greyer the smaller it is.
 export class RuleColours {
-  // rule: of RuleWorld; its `classes` are {palette, undecided}, or null.
-  constructor(rule, kernels) {
+  // rule: of RuleWorld; its `classes` are {palette, undecided}, or null. offset: COLOUR_OFFSET of the constants.
+  constructor(rule, kernels, offset) {
     this.classes = rule.classes;
+    this.offset = offset;
     this.channels = rule.state_dim;
     const { weights, readout_dim: outputs, readout_hidden_dim: hidden } = rule;
     this.kernels = kernels;
@@ -152,8 +148,8 @@ export class RuleColours {
   // Red, green and blue of a particle whose outputs begin at index `at` of `values`.
   tint(values, at) {
     if (this.classes === null) {
-      const last = at + this.outputs;
-      return [values[last - 3] + COLOUR_OFFSET, values[last - 2] + COLOUR_OFFSET, values[last - 1] + COLOUR_OFFSET];
+      const last = at + this.outputs, { offset } = this;
+      return [values[last - 3] + offset, values[last - 2] + offset, values[last - 1] + offset];
     }
     const { palette, undecided } = this.classes;
     let chosen = 0;

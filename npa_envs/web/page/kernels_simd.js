@@ -1,7 +1,7 @@
 // The kernels of `plainKernels` of physics.js in WebAssembly, whose vectors of four float32 make a step more than twice
-// as fast. The page builds the module when it starts: `xCode` writes kernel x by functions that return the
-// bytes of instructions (the assembler below), and `assemble` joins the kernels. So no compiler is needed, and sizes
-// are constants in the code. Instructions and format: https://webassembly.github.io/spec/core/binary/.
+// as fast. The page builds the module when it starts: `xCode` writes kernel x as in WebAssembly text, by functions that
+// return the bytes of instructions (the assembler below), and `assemble` joins the kernels. So no compiler is needed,
+// and sizes are constants in the code. Instructions and format: https://webassembly.github.io/spec/core/binary/.
 
 import { plainKernels, TILE_OUTPUTS, tiledLayer } from "./physics.js";
 
@@ -36,171 +36,158 @@ function signed(value) {
 const vector = (code, ...rest) => [0xfd, ...unsigned(code), ...rest];
 const unary = (...code) => (value) => [...value, ...code];
 const binary = (...code) => (left, right) => [...left, ...right, ...code];
-const get = (local) => [0x20, ...unsigned(local)];
-const set = (local, value) => [...value, 0x21, ...unsigned(local)];
-const when = (condition, body) => [...condition, 0x04, 0x40, ...body, 0x0b];
 const select = (yes, no, condition) => [...yes, ...no, ...condition, 0x1b];
 
-// Integers.
-const number = (value) => [0x41, ...signed(value)];
-const add = binary(0x6a), multiply = binary(0x6c), below = binary(0x49), ones = unary(0x69);
-const loadInteger = unary(0x28, 2, 0), storeInteger = binary(0x36, 2, 0);
+// Instructions by the types and names of WebAssembly text; arguments are the bytes of operands. Addresses of arrays
+// are multiples of 2^2 bytes, which the 2 of loads and stores says.
+const i32 = {
+  const: (value) => [0x41, ...signed(value)], load: unary(0x28, 2, 0), store: binary(0x36, 2, 0),
+  eqz: unary(0x45), lt_u: binary(0x49), popcnt: unary(0x69), add: binary(0x6a), mul: binary(0x6c),
+};
+const v128 = {
+  const: (bytes) => vector(0x0c, ...bytes), and: binary(...vector(0x4e)),
+  load: (at, offset = 0) => [...at, ...vector(0x00, 2, ...unsigned(offset))],
+  load32_splat: (at, offset = 0) => [...at, ...vector(0x09, 2, ...unsigned(offset))],
+  store: (at, value, offset = 0) => [...at, ...value, ...vector(0x0b, 2, ...unsigned(offset))],
+};
+const f32x4 = {
+  lt: binary(...vector(0x43)), nearest: unary(...vector(0x6a)), sqrt: unary(...vector(0xe3)),
+  add: binary(...vector(0xe4)), sub: binary(...vector(0xe5)), mul: binary(...vector(0xe6)),
+  div: binary(...vector(0xe7)), max: binary(...vector(0xe9)),
+};
+const i32x4 = {
+  splat: unary(...vector(0x11)), lt_s: binary(...vector(0x39)), bitmask: unary(...vector(0xa4)),
+  add: binary(...vector(0xae)), mul: binary(...vector(0xb5)),
+};
+const i8x16 = { swizzle: binary(...vector(0x0e)) };
+const [BLOCK, LOOP, IF, END, BR, BR_IF, NO_RESULT] = [0x02, 0x03, 0x04, 0x0b, 0x0c, 0x0d, 0x40];
 
-// Vectors of four floats, and of four integers.
-const constant = (bytes) => vector(0x0c, ...bytes);
-const load = (at, offset = 0) => [...at, ...vector(0x00, 2, ...unsigned(offset))];
-const loadSplat = (at, offset = 0) => [...at, ...vector(0x09, 2, ...unsigned(offset))];
-const store = (at, value, offset = 0) => [...at, ...value, ...vector(0x0b, 2, ...unsigned(offset))];
-const plus = binary(...vector(0xe4)), minus = binary(...vector(0xe5)), times = binary(...vector(0xe6));
-const over = binary(...vector(0xe7)), root = unary(...vector(0xe3)), nearest = unary(...vector(0x6a));
-const larger = binary(...vector(0xe9)), less = binary(...vector(0x43)), and = binary(...vector(0x4e));
-const spreadInteger = unary(...vector(0x11)), bits = unary(...vector(0xa4));
-const plusIntegers = binary(...vector(0xae)), timesIntegers = binary(...vector(0xb5));
-const lessIntegers = binary(...vector(0x39)), shuffled = binary(...vector(0x0e));
-
-const zeros = constant(new Array(16).fill(0));
+const zeros = v128.const(new Array(16).fill(0));
 
 // Repeats a body while a local is below a limit; tests before the first time.
 function loopBelow(local, limit, body) {
-  return [0x02, 0x40, 0x03, 0x40, ...below(get(local), limit), 0x45, 0x0d, 1, ...body, 0x0c, 0, 0x0b, 0x0b];
+  const leave = [...i32.eqz(i32.lt_u(local.get, limit)), BR_IF, 1];
+  return [BLOCK, NO_RESULT, LOOP, NO_RESULT, ...leave, ...body, BR, 0, END, END];
 }
 
-// A function's locals by name: its parameters and other integers, then vectors; `counts` are how many.
-function namedLocals(parameters, integers, vectors) {
-  const names = [...parameters, ...integers, ...vectors];
-  const local = (name) => names.indexOf(name);
-  return {
-    local, value: (name) => get(local(name)), put: (name, code) => set(local(name), code),
-    counts: { parameters: parameters.length, integers: integers.length, vectors: vectors.length },
-  };
+// Makers of a function's locals: `parameters`, then `integers`, then `vectors` return as many new ones as asked for.
+function makeLocals() {
+  const counts = { parameters: 0, integers: 0, vectors: 0 };
+  let made = 0;
+  const makerOf = (kind) => (count) => Array.from({ length: count }, () => {
+    const index = unsigned(made++);
+    counts[kind]++;
+    return { get: [0x20, ...index], set: (value) => [...value, 0x21, ...index] };
+  });
+  return { counts, parameters: makerOf("parameters"), integers: makerOf("integers"), vectors: makerOf("vectors") };
 }
-
-// The axes, and the factors of a particle's neighbours in the sums.
-const AXES = ["X", "Y", "Z"], LISTS = ["smoothing", "slopeX", "slopeY", "slopeZ"];
 
 // sumNeighbours(states, own, listBytes, stateAt, smoothing, slopeX, slopeY, slopeZ, sums): addresses in bytes; `own` is
 // that of the particle's state.
 function sumNeighboursCode(width, dimension) {
-  const lists = LISTS.slice(0, dimension + 1);
-  const { local, value, put, counts } = namedLocals(
-    ["states", "own", "listBytes", "stateAt", ...LISTS, "sums"],
-    ["done", "at"],
-    [
-      "other", "offset", ...LISTS.map((list) => `spread ${list}`), "mine 0", "mine 1",
-      ...LISTS.flatMap((list) => [`sum ${list} 0`, `sum ${list} 1`]),
-    ],
-  );
+  const { counts, parameters, integers, vectors } = makeLocals();
+  const [states, own, listBytes, stateAt] = parameters(4), lists = parameters(4), [sums] = parameters(1);
+  const [done, at] = integers(2);
+  const [other, offset] = vectors(2), factors = vectors(4), mine = vectors(2);
+  // The sums of each list, each of two vectors; in 2D the last list is not used.
+  const listSums = lists.map(() => vectors(2)).slice(0, dimension + 1);
   const code = [];
+  const addProduct = (sum, factor, term) => sum.set(f32x4.add(sum.get, f32x4.mul(factor.get, term.get)));
   // Two vectors at a time: their sums stay in registers.
   for (let first = 0; first < width; first += 8) {
     const parts = first + 4 < width ? [0, 1] : [0];
     const byte = (part) => 4 * first + 16 * part;
-    const addNeighbour = (list, part) => {
-      const sum = `sum ${list} ${part}`, factor = value(list === "smoothing" ? "other" : "offset");
-      return put(sum, plus(value(sum), times(value(`spread ${list}`), factor)));
-    };
     const neighbour = [
-      ...put("at", add(value("states"), multiply(loadInteger(add(value("stateAt"), value("done"))), number(4)))),
-      ...lists.flatMap((list) => put(`spread ${list}`, loadSplat(add(value(list), value("done"))))),
+      ...at.set(i32.add(states.get, i32.mul(i32.load(i32.add(stateAt.get, done.get)), i32.const(4)))),
+      ...listSums.flatMap((_, k) => factors[k].set(v128.load32_splat(i32.add(lists[k].get, done.get)))),
       ...parts.flatMap((part) => [
-        ...put("other", load(value("at"), byte(part))),
-        ...put("offset", minus(value("other"), value(`mine ${part}`))),
-        ...lists.flatMap((list) => addNeighbour(list, part)),
+        ...other.set(v128.load(at.get, byte(part))),
+        ...offset.set(f32x4.sub(other.get, mine[part].get)),
+        ...listSums.flatMap(({ [part]: sum }, k) => addProduct(sum, factors[k], k === 0 ? other : offset)),
       ]),
-      ...put("done", add(value("done"), number(4))),
+      ...done.set(i32.add(done.get, i32.const(4))),
     ];
     code.push(
       ...parts.flatMap((part) => [
-        ...put(`mine ${part}`, load(value("own"), byte(part))),
-        ...lists.flatMap((list) => put(`sum ${list} ${part}`, zeros)),
+        ...mine[part].set(v128.load(own.get, byte(part))),
+        ...listSums.flatMap((sum) => sum[part].set(zeros)),
       ]),
-      ...put("done", number(0)),
-      ...loopBelow(local("done"), value("listBytes"), neighbour),
-      ...parts.flatMap((part) => lists.flatMap((list, k) =>
-        store(value("sums"), value(`sum ${list} ${part}`), 4 * width * k + byte(part)))),
+      ...done.set(i32.const(0)),
+      ...loopBelow(done, listBytes.get, neighbour),
+      ...parts.flatMap((part) => listSums.flatMap((sum, k) =>
+        v128.store(sums.get, sum[part].get, 4 * width * k + byte(part)))),
     );
   }
   return { ...counts, code };
 }
 
-// The particle whose neighbours `listNeighbours` lists, and constants of the step: each a word in memory.
-const SCALARS = ["x", "y", "z", "eps", "square", "weight", "slope", "sideX", "sideY", "sideZ", "perX", "perY", "perZ"];
+// The number of the particle's and the step's constants that `listNeighbours` reads, each a word in memory: position
+// (3), eps, eps², weight, slope, sides (3), inverse sides (3).
+const SCALARS = 13;
 
 // listNeighbours(scalars, order, X, Y, Z, volume, ranges, rangesEnd, width, stateAt, smoothing, slopeX, slopeY, slopeZ,
 // out): `order` has for each set of lanes the bytes that bring them to the front; `out` gets the number of neighbours,
 // and from its 16th byte on six vectors, whose lanes add up to the entries of the moment matrix.
 function listNeighboursCode(dimension) {
-  const names = namedLocals(
-    ["scalars", "order", ...AXES, "volume", "ranges", "rangesEnd", "width", "stateAt", ...LISTS, "out"],
-    ["byte", "end", "count", "hits", "at"],
-    [
-      "lanes", "dX", "dY", "dZ", "squared", "inside", "left", "distance", "factor", "front",
-      "XX", "XY", "XZ", "YY", "YZ", "ZZ", "sX", "sY", "sZ",
-      ...SCALARS.map((name) => `scalar ${name}`),
-    ],
-  );
-  const { local, value, put, counts } = names;
-  const scalar = (name) => value(`scalar ${name}`);
-  const axes = AXES.slice(0, dimension);
-  const offset = (axis) => {
-    const difference = value(`d${axis}`);
-    return [
-      ...put(`d${axis}`, minus(load(add(value(axis), value("byte"))), scalar(axis.toLowerCase()))),
-      ...put(`d${axis}`, minus(difference, times(scalar(`side${axis}`), nearest(times(difference, scalar(`per${axis}`)))))),
-    ];
-  };
-  const squares = axes.map((axis) => times(value(`d${axis}`), value(`d${axis}`)));
-  const four = [
-    ...axes.flatMap(offset),
-    ...put("squared", squares.reduce((sum, square) => plus(sum, square))),
-    ...put("inside", and(less(value("squared"), scalar("square")), lessIntegers(value("lanes"), spreadInteger(value("end"))))),
-    ...put("hits", bits(value("inside"))),
-    ...when(value("hits"), appendNeighboursCode(names, axes)),
-    ...put("byte", add(value("byte"), number(16))),
-    ...put("lanes", plusIntegers(value("lanes"), spreadInteger(number(4)))),
+  const { counts, parameters, integers, vectors } = makeLocals();
+  const [scalars, order] = parameters(2), positions = parameters(3), [volume, ranges, rangesEnd, width] = parameters(4);
+  const [stateAt, smoothing] = parameters(2), slopes = parameters(3), [out] = parameters(1);
+  const [byte, end, count, hits, at] = integers(5);
+  const [lanes] = vectors(1), d = vectors(3), [squared, inside, left, distance, factor, front] = vectors(6);
+  const moment = [vectors(3), vectors(2), vectors(1)]; // the upper triangle, row by row
+  const scaled = vectors(3), constants = vectors(SCALARS), [eps, square, weight, slope] = constants.slice(3);
+  const [own, sides, perSide] = [0, 7, 10].map((first) => constants.slice(first, first + 3));
+  const axes = [0, 1, 2].slice(0, dimension);
+
+  const append = (list, code) => v128.store(i32.add(list.get, at.get), i8x16.swizzle(code, front.get));
+  const volumes = v128.load(i32.add(volume.get, byte.get));
+  const appendFour = [
+    ...distance.set(f32x4.sqrt(squared.get)),
+    ...left.set(f32x4.sub(square.get, squared.get)),
+    ...factor.set(f32x4.sub(eps.get, distance.get)),
+    ...factor.set(f32x4.div(f32x4.mul(slope.get, f32x4.mul(factor.get, factor.get)), distance.get)),
+    ...factor.set(f32x4.mul(factor.get, volumes)),
+    // Masks the NaN of the particle itself, and lanes behind the last particle.
+    ...factor.set(v128.and(factor.get, v128.and(inside.get, f32x4.lt(zeros, squared.get)))),
+    ...axes.flatMap((a) => scaled[a].set(f32x4.mul(factor.get, d[a].get))),
+    ...axes.flatMap((a) => axes.slice(a).flatMap((b) =>
+      moment[a][b - a].set(f32x4.add(moment[a][b - a].get, f32x4.mul(scaled[a].get, d[b].get))))),
+    ...front.set(v128.load(i32.add(order.get, i32.mul(hits.get, i32.const(16))))),
+    ...at.set(i32.mul(count.get, i32.const(4))),
+    ...append(stateAt, i32x4.mul(lanes.get, i32x4.splat(width.get))),
+    ...append(smoothing,
+      f32x4.mul(f32x4.mul(weight.get, f32x4.mul(left.get, f32x4.mul(left.get, left.get))), volumes)),
+    ...axes.flatMap((a) => append(slopes[a], scaled[a].get)),
+    ...count.set(i32.add(count.get, i32.popcnt(hits.get))),
   ];
-  const firstLanes = constant([0, 0, 0, 0, 1, 0, 0, 0, 2, 0, 0, 0, 3, 0, 0, 0]);
+  const toNearest = (a) => f32x4.mul(sides[a].get, f32x4.nearest(f32x4.mul(d[a].get, perSide[a].get)));
+  const four = [
+    ...axes.flatMap((a) => [
+      ...d[a].set(f32x4.sub(v128.load(i32.add(positions[a].get, byte.get)), own[a].get)),
+      ...d[a].set(f32x4.sub(d[a].get, toNearest(a))),
+    ]),
+    ...squared.set(axes.map((a) => f32x4.mul(d[a].get, d[a].get)).reduce((sum, term) => f32x4.add(sum, term))),
+    ...inside.set(v128.and(f32x4.lt(squared.get, square.get), i32x4.lt_s(lanes.get, i32x4.splat(end.get)))),
+    ...hits.set(i32x4.bitmask(inside.get)),
+    ...hits.get, IF, NO_RESULT, ...appendFour, END,
+    ...byte.set(i32.add(byte.get, i32.const(16))),
+    ...lanes.set(i32x4.add(lanes.get, i32x4.splat(i32.const(4)))),
+  ];
+  const firstLanes = v128.const([0, 0, 0, 0, 1, 0, 0, 0, 2, 0, 0, 0, 3, 0, 0, 0]);
   const range = [
-    ...put("byte", multiply(loadInteger(value("ranges")), number(4))),
-    ...put("lanes", plusIntegers(spreadInteger(loadInteger(value("ranges"))), firstLanes)),
-    ...put("end", loadInteger(add(value("ranges"), number(4)))),
-    ...loopBelow(local("byte"), multiply(value("end"), number(4)), four),
-    ...put("ranges", add(value("ranges"), number(8))),
+    ...byte.set(i32.mul(i32.load(ranges.get), i32.const(4))),
+    ...lanes.set(i32x4.add(i32x4.splat(i32.load(ranges.get)), firstLanes)),
+    ...end.set(i32.load(i32.add(ranges.get, i32.const(4)))),
+    ...loopBelow(byte, i32.mul(end.get, i32.const(4)), four),
+    ...ranges.set(i32.add(ranges.get, i32.const(8))),
   ];
   const code = [
-    ...SCALARS.flatMap((name, k) => put(`scalar ${name}`, loadSplat(value("scalars"), 4 * k))),
-    ...loopBelow(local("ranges"), value("rangesEnd"), range),
-    ...storeInteger(value("out"), value("count")),
-    ...["XX", "XY", "XZ", "YY", "YZ", "ZZ"].flatMap((name, k) => store(value("out"), value(name), 16 + 16 * k)),
+    ...constants.flatMap((local, k) => local.set(v128.load32_splat(scalars.get, 4 * k))),
+    ...loopBelow(ranges, rangesEnd.get, range),
+    ...i32.store(out.get, count.get),
+    ...moment.flat().flatMap((entry, k) => v128.store(out.get, entry.get, 16 + 16 * k)),
   ];
   return { ...counts, code };
-}
-
-// The part of `listNeighbours` that appends those of four particles that are neighbours.
-function appendNeighboursCode({ value, put }, axes) {
-  const scalar = (name) => value(`scalar ${name}`);
-  const append = (list, code) => store(add(value(list), value("at")), shuffled(code, value("front")));
-  return [
-    ...put("distance", root(value("squared"))),
-    ...put("left", minus(scalar("square"), value("squared"))),
-    ...put("factor", minus(scalar("eps"), value("distance"))),
-    ...put("factor", over(times(scalar("slope"), times(value("factor"), value("factor"))), value("distance"))),
-    ...put("factor", times(value("factor"), load(add(value("volume"), value("byte"))))),
-    // Masks the NaN of the particle itself, and lanes behind the last particle.
-    ...put("factor", and(value("factor"), and(value("inside"), less(zeros, value("squared"))))),
-    ...axes.flatMap((axis) => put(`s${axis}`, times(value("factor"), value(`d${axis}`)))),
-    ...axes.flatMap((axis, k) => axes.slice(k).flatMap((other) =>
-      put(axis + other, plus(value(axis + other), times(value(`s${axis}`), value(`d${other}`)))))),
-    ...put("front", load(add(value("order"), multiply(value("hits"), number(16))))),
-    ...put("at", multiply(value("count"), number(4))),
-    ...append("stateAt", timesIntegers(value("lanes"), spreadInteger(value("width")))),
-    ...append("smoothing", times(
-      times(scalar("weight"), times(value("left"), times(value("left"), value("left")))),
-      load(add(value("volume"), value("byte"))),
-    )),
-    ...axes.flatMap((axis) => append(`slope${axis}`, value(`s${axis}`))),
-    ...put("count", add(value("count"), ones(value("hits")))),
-  ];
 }
 
 // For each set of four lanes the bytes that bring them to the front, in order: [16, 16].
@@ -218,48 +205,46 @@ function lanesToFront() {
 // applyLayer(rows, rowBytes, rowEnd, weights, bias, outputs, outputBytes, inputBytes, limit, tiles): for all
 // rows out = W in + b, and max(out, 0) where `limit` is 1. Weights lie tile by tile: [tiles, inputs, 8].
 function applyLayerCode() {
-  const four = [0, 1, 2, 3];
-  const { local, value, put, counts } = namedLocals(
-    ["rows", "rowBytes", "rowEnd", "weights", "bias", "outputs", "outputBytes", "inputBytes", "limit", "tiles"],
-    ["row", "input", "weight", "out", "tile", ...four.map((k) => `at ${k}`)],
-    ["left", "right", "spread", "other", ...four.flatMap((k) => [`left ${k}`, `right ${k}`])],
-  );
-  const addProduct = (sum, weights) => put(sum, plus(value(sum), times(value("spread"), value(weights))));
+  const { counts, parameters, integers, vectors } = makeLocals();
+  const [rows, rowBytes, rowEnd, weights, bias, outputs, outputBytes, inputBytes, limit, tiles] = parameters(10);
+  const [row, input, weight, out, tile] = integers(5), at = integers(4);
+  const [left, right, spread, other] = vectors(4), sums = at.map(() => vectors(2));
+  const addProduct = (sum, four) => sum.set(f32x4.add(sum.get, f32x4.mul(spread.get, four.get)));
   const limited = (sum, byte) => [
-    ...put("other", value(sum)),
-    ...store(value("out"), select(larger(value("other"), zeros), value("other"), value("limit")), byte),
+    ...other.set(sum.get),
+    ...v128.store(out.get, select(f32x4.max(other.get, zeros), other.get, limit.get), byte),
   ];
   const inner = [
-    ...put("left", load(value("weight"))), ...put("right", load(value("weight"), 16)),
-    ...four.flatMap((k) => [
-      ...put("spread", loadSplat(add(value(`at ${k}`), value("input")))),
-      ...addProduct(`left ${k}`, "left"), ...addProduct(`right ${k}`, "right"),
+    ...left.set(v128.load(weight.get)), ...right.set(v128.load(weight.get, 16)),
+    ...sums.flatMap(([leftSum, rightSum], k) => [
+      ...spread.set(v128.load32_splat(i32.add(at[k].get, input.get))),
+      ...addProduct(leftSum, left), ...addProduct(rightSum, right),
     ]),
-    ...put("weight", add(value("weight"), number(4 * TILE_OUTPUTS))),
-    ...put("input", add(value("input"), number(4))),
+    ...weight.set(i32.add(weight.get, i32.const(4 * TILE_OUTPUTS))),
+    ...input.set(i32.add(input.get, i32.const(4))),
   ];
   const perRows = [
-    ...four.flatMap((k) => [
-      ...put(`at ${k}`, add(value("row"), multiply(value("rowBytes"), number(k)))),
-      ...put(`left ${k}`, load(value("bias"))), ...put(`right ${k}`, load(value("bias"), 16)),
+    ...sums.flatMap(([leftSum, rightSum], k) => [
+      ...at[k].set(i32.add(row.get, i32.mul(rowBytes.get, i32.const(k)))),
+      ...leftSum.set(v128.load(bias.get)), ...rightSum.set(v128.load(bias.get, 16)),
     ]),
-    ...put("weight", value("weights")), ...put("input", number(0)),
-    ...loopBelow(local("input"), value("inputBytes"), inner),
-    ...four.flatMap((k) => [
-      ...limited(`left ${k}`, 0), ...limited(`right ${k}`, 16),
-      ...put("out", add(value("out"), value("outputBytes"))),
+    ...weight.set(weights.get), ...input.set(i32.const(0)),
+    ...loopBelow(input, inputBytes.get, inner),
+    ...sums.flatMap(([leftSum, rightSum]) => [
+      ...limited(leftSum, 0), ...limited(rightSum, 16),
+      ...out.set(i32.add(out.get, outputBytes.get)),
     ]),
-    ...put("row", add(value("row"), multiply(value("rowBytes"), number(TILE_ROWS)))),
+    ...row.set(i32.add(row.get, i32.mul(rowBytes.get, i32.const(TILE_ROWS)))),
   ];
   const perTile = [
-    ...put("row", value("rows")),
-    ...put("out", add(value("outputs"), multiply(value("tile"), number(4 * TILE_OUTPUTS)))),
-    ...loopBelow(local("row"), value("rowEnd"), perRows),
-    ...put("weights", add(value("weights"), multiply(value("inputBytes"), number(TILE_OUTPUTS)))),
-    ...put("bias", add(value("bias"), number(4 * TILE_OUTPUTS))),
-    ...put("tile", add(value("tile"), number(1))),
+    ...row.set(rows.get),
+    ...out.set(i32.add(outputs.get, i32.mul(tile.get, i32.const(4 * TILE_OUTPUTS)))),
+    ...loopBelow(row, rowEnd.get, perRows),
+    ...weights.set(i32.add(weights.get, i32.mul(inputBytes.get, i32.const(TILE_OUTPUTS)))),
+    ...bias.set(i32.add(bias.get, i32.const(4 * TILE_OUTPUTS))),
+    ...tile.set(i32.add(tile.get, i32.const(1))),
   ];
-  return { ...counts, code: [...put("tile", number(0)), ...loopBelow(local("tile"), value("tiles"), perTile)] };
+  return { ...counts, code: [...tile.set(i32.const(0)), ...loopBelow(tile, tiles.get, perTile)] };
 }
 
 // A module of some functions, exported by their names; all parameters are integers, none returns.
@@ -274,7 +259,7 @@ function assemble(functions) {
   const exported = named.map(([name], index) => [...text(name), 0x00, ...unsigned(index)]);
   const bodies = named.map(([, { integers, vectors, code }]) => {
     const locals = list([[...unsigned(integers), INTEGER], [...unsigned(vectors), VECTOR]]);
-    const body = [...locals, ...code, 0x0b];
+    const body = [...locals, ...code, END];
     return [...unsigned(body.length), ...body];
   });
   return new Uint8Array([
@@ -327,7 +312,7 @@ export function simdKernels(width, dimension) {
     );
   }
 
-  const scalars = floats(SCALARS.length);
+  const scalars = floats(SCALARS);
   const order = reserve(Uint8Array, 256);
   order.set(lanesToFront());
   const out = floats(4 + 6 * 4);

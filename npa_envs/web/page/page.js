@@ -11,10 +11,10 @@ const BLANK = {
   capabilities: [], playing: true, seed: 0,
 };
 
-// The tools are this one, which sends no messages, and the world's brushes.
+// The page's own brush, before those of the world: it sends no messages.
 const LOOK = { name: "look", label: "Look: drag to move, wheel or pinch to zoom, double click to see all" };
 
-// SVG paths on a square of side 24, by the names of tools and controls.
+// SVG paths on a square of side 24, by the names of brushes and controls.
 const ICONS = {
   look: "M12 5v14M5 12h14M12 5l-2 2M12 5l2 2M12 19l-2-2M12 19l2-2M5 12l2-2M5 12l2 2M19 12l-2-2M19 12l-2 2",
   remove: "M4 15l8-9 7 6-7 8H8zM9 20h11",
@@ -72,7 +72,7 @@ class Page {
       milliseconds: new Plot($("plots"), "Time of a step", "ms"),
     };
     this.curves = {}; // plots of the events "curve", by name
-    this.tools = new Tools(this);
+    this.brushes = new Brushes(this);
     this.film = new Film(this);
     this.controls = new Controls(this);
     requestAnimationFrame(() => this.drawIfNeeded());
@@ -102,9 +102,9 @@ class Page {
       this.frame = null;
       // Also for undrawn frames of the former world: the engine waits for each.
       this.reportDrawn();
-      const first = world.dimension === 2 ? "remove" : "look", { name: chosen } = this.tools.chosen;
+      const first = world.dimension === 2 ? "remove" : "look", { name: chosen } = this.brushes.chosen;
       const keeps = before.dimension === world.dimension && world.tools.some(({ name }) => name === chosen);
-      this.tools.choose(keeps ? chosen : first);
+      this.brushes.choose(keeps ? chosen : first);
     }
     if (before.rule !== world.rule || before.seed !== world.seed) {
       this.tracers.clear();
@@ -145,7 +145,7 @@ class Page {
   // In each frame of the screen: the brush acts, and new frames of the world are drawn.
   drawIfNeeded() {
     requestAnimationFrame(() => this.drawIfNeeded());
-    this.tools.act();
+    this.brushes.act();
     if (!this.undrawn && !this.dirty) return;
     if (this.undrawn) this.readFrame();
     this.draw();
@@ -189,21 +189,21 @@ class Page {
       positions: frame?.positions ?? new Float32Array(), colours: frame?.colours ?? new Uint8Array(),
       dimension: world.dimension, box: world.box, spot: world.spot * $("size").value, camera,
       background: this.background, look: $("style").value, ink: this.ink,
-      still: still || (!world.playing && !this.tools.stroke),
+      still: still || (!world.playing && !this.brushes.stroke),
       trails: $("tracers").checked ? this.tracers.lines(world.box) : null,
     });
     this.film.add();
   }
 }
 
-// The chosen tool and the pointers on the canvas: one pointer uses the tool, two move the camera.
-class Tools {
+// The chosen brush and the pointers on the canvas: one pointer uses the brush, two move the camera.
+class Brushes {
   constructor(page) {
     this.page = page;
     this.chosen = LOOK;
     this.pointers = new Map();
     this.looking = false; // whether pressed pointers move the camera
-    // A brush from press to release: nearness of what it touches, and pixels where it began, is now, and last acted.
+    // A use from press to release: nearness of what it touches, and pixels where it began, is now, and last acted.
     this.stroke = null;
     const canvas = (this.canvas = page.canvas);
     canvas.onpointerdown = (event) => this.press(event);
@@ -224,11 +224,11 @@ class Tools {
     return [LOOK, ...this.page.world.tools];
   }
 
-  // Takes the tool of a name, or "look" if the world does not offer it.
+  // Takes the brush of a name, or "look" if the world does not offer it.
   choose(name) {
-    this.chosen = this.offered.find((tool) => tool.name === name) ?? LOOK;
-    for (const button of $("tools").children)
-      button.setAttribute("aria-checked", String(button.dataset.tool === this.chosen.name));
+    this.chosen = this.offered.find((brush) => brush.name === name) ?? LOOK;
+    for (const button of $("brushes").children)
+      button.setAttribute("aria-checked", String(button.dataset.brush === this.chosen.name));
     if (this.chosen === LOOK) $("cursor").hidden = true;
     this.canvas.style.cursor = this.chosen === LOOK ? "grab" : "crosshair";
   }
@@ -250,7 +250,7 @@ class Tools {
     }
     const near = this.nearness(position);
     this.stroke = { near, from: position, at: position, sent: position };
-    if (this.chosen.sends !== "line") this.brush(position, [0, 0]);
+    if (this.chosen.sends !== "line") this.use(position, [0, 0]);
     this.showCursor(position);
   }
 
@@ -281,7 +281,7 @@ class Tools {
     this.pointers.delete(event.pointerId);
     if (stroke && this.chosen.sends === "line" && event.type === "pointerup") {
       const move = [stroke.at[0] - stroke.from[0], stroke.at[1] - stroke.from[1]];
-      if (Math.hypot(...move) > 4) this.brush(stroke.from, move);
+      if (Math.hypot(...move) > 4) this.use(stroke.from, move);
     }
     this.stroke = null;
     $("knife").hidden = true;
@@ -303,20 +303,20 @@ class Tools {
     return Number.isFinite(nearest) ? nearest : 0;
   }
 
-  // Sends the brush at a position on the canvas, with its movement, both in pixels.
-  brush(position, pixels) {
-    const { canvas, stroke, chosen: tool, page: { camera, world: { dimension, box } } } = this;
+  // Sends a use of the brush at a position on the canvas, with its movement, both in pixels.
+  use(position, pixels) {
+    const { canvas, stroke, chosen: brush, page: { camera, world: { dimension, box } } } = this;
     const width = canvas.clientWidth, height = canvas.clientHeight;
     const at = camera.position(...position, width, height, stroke.near).slice(0, dimension);
     const move = camera.movement(...pixels, width, height, stroke.near).slice(0, dimension);
     const wrapped = box ? at.map((v, k) => v - box[k] * Math.round(v / box[k])) : at;
     stroke.source ??= wrapped;
     const message = {
-      type: "brush", tool: tool.name, at: wrapped, move,
+      type: "brush", tool: brush.name, at: wrapped, move,
       radius: this.radius(), strength: +$("strength").value,
     };
-    if (tool.takes === "source") message.source = stroke.source;
-    if (tool.takes === "rule") message.rule = $("other").value;
+    if (brush.takes === "source") message.source = stroke.source;
+    if (brush.takes === "rule") message.rule = $("other").value;
     if (dimension === 3) message.view = camera.axes[2];
     this.page.send(message);
   }
@@ -348,8 +348,8 @@ class Tools {
     const { stroke, chosen: { sends } } = this;
     if (!stroke) return;
     const move = [stroke.at[0] - stroke.sent[0], stroke.at[1] - stroke.sent[1]], moved = Math.hypot(...move) > 0;
-    if (sends === "frame" || (sends === "motion" && moved)) this.brush(stroke.sent, move);
-    if (sends === "position" && moved) this.brush(stroke.at, [0, 0]);
+    if (sends === "frame" || (sends === "motion" && moved)) this.use(stroke.sent, move);
+    if (sends === "position" && moved) this.use(stroke.at, [0, 0]);
     stroke.sent = stroke.at;
   }
 }
@@ -398,7 +398,7 @@ class Controls {
     $("rule-field").hidden = world.rules.length < 2;
     $("other-field").hidden = !world.tools.some(({ takes }) => takes === "rule");
     $("brush").hidden = !world.tools.length;
-    this.showTools();
+    this.showBrushes();
     $("damages").hidden = !world.damages.length;
     $("damages").replaceChildren(...world.damages.map((name) => make("button", {
       textContent: name, title: `Damage: ${name}`, onclick: () => this.page.send({ type: "damage", name }),
@@ -428,20 +428,20 @@ class Controls {
     this.page.dirty = true;
   }
 
-  showTools() {
-    const { tools } = this.page, names = tools.offered.map(({ name }) => name).join();
-    if ($("tools").dataset.names === names) return;
-    $("tools").dataset.names = names;
-    $("tools").replaceChildren(...tools.offered.map(({ name, label }, k) => {
+  showBrushes() {
+    const { brushes } = this.page, names = brushes.offered.map(({ name }) => name).join();
+    if ($("brushes").dataset.names === names) return;
+    $("brushes").dataset.names = names;
+    $("brushes").replaceChildren(...brushes.offered.map(({ name, label }, k) => {
       const button = make("button", {
-        innerHTML: icon(name), title: `${label} (${k + 1})`, onclick: () => tools.choose(name),
+        innerHTML: icon(name), title: `${label} (${k + 1})`, onclick: () => brushes.choose(name),
       });
-      button.dataset.tool = name;
+      button.dataset.brush = name;
       button.setAttribute("role", "radio");
       button.setAttribute("aria-label", name);
       return button;
     }));
-    tools.choose(tools.chosen.name);
+    brushes.choose(brushes.chosen.name);
   }
 
   slider(input, name, { value, low, high, scale, whole }) {
@@ -473,7 +473,7 @@ class Controls {
       " ": () => this.page.play(!this.page.world.playing), s: () => $("one").click(), r: () => $("reset").click(),
       p: () => $("fold").click(), f: () => this.page.fit(),
     };
-    const act = acts[event.key] ?? $("tools").children[+event.key - 1]?.onclick;
+    const act = acts[event.key] ?? $("brushes").children[+event.key - 1]?.onclick;
     if (!act || (event.key === " " && event.target.matches("button, summary"))) return;
     event.preventDefault();
     act();

@@ -9,9 +9,8 @@
 //   network                applyLayer           applyLayerCode        advance
 //   new positions, states  update
 //
-// Tests compare steps with Python's: tests/web/test_export.py by this file and by kernels_simd.js,
-// test_export_browser.py by physics_gpu.js. Here particles are sorted by cell, densities are summed over pairs in
-// double precision, and only active particles perceive.
+// test_a_step_of_each_engine_is_that_of_python of tests/web/test_export_browser.py compares all three in random worlds.
+// Here particles are sorted by cell, densities are sums over pairs in float64, and only active particles perceive.
 
 export const MOMENT_THRESHOLD = 1e-3;
 export const SQUARED_MOMENT_SOFTENING = 1e-2 ** 2;
@@ -198,15 +197,12 @@ export class Physics {
   // Advances a world {count, x, s, species} by one step, in place.
   //
   // eps: perception radius [length units]; box: sides, or null; mask: Uint8Array, 1 where a particle
-  // is updated, or null for all; noise: offsets of positions, or null; densityCounts: divisors of each
-  // rule's densities, by default the particles of the world.
+  // is updated, or null for all; noise: offsets of positions, or null; densityCounts: numbers by which
+  // each rule's densities are divided, by default the particles of the world.
   step(world, { eps, box = null, mask = null, noise = null, densityCounts = null }) {
     this.sort(world, eps, box);
     this.computeDensities(world.count);
-    for (let number = 0; number < this.rules.length; number++) {
-      const divisor = densityCounts === null ? world.count : densityCounts[number];
-      this.advance(world, number, divisor, mask);
-    }
+    this.rules.forEach((_, number) => this.advance(world, number, densityCounts?.[number] ?? world.count, mask));
     this.finish(world, noise, box);
   }
 
@@ -369,7 +365,7 @@ export class Physics {
   }
 
   // Perceives the active particles of one rule, runs its network, and updates them.
-  advance(world, number, divisor, mask) {
+  advance(world, number, densityCount, mask) {
     const { order, starts, blockRows, kernels, rows, rowWidth, hidden, updates } = this;
     const rule = this.rules[number];
     const total = this.cells[0] * this.cells[1] * this.cells[2];
@@ -390,7 +386,7 @@ export class Physics {
         if (world.species[particle] !== number || (mask !== null && mask[particle] === 0)) continue;
         if (!found) this.rangesAround(cell);
         found = true;
-        this.perceive(rule, i, filled * rowWidth, divisor);
+        this.perceive(rule, i, filled * rowWidth, densityCount);
         blockRows[filled++] = i;
         if (filled === BLOCK_ROWS) flush();
       }
@@ -399,7 +395,7 @@ export class Physics {
   }
 
   // Writes the perception vector of sorted particle i into `rows` at `at`.
-  perceive(rule, i, at, divisor) {
+  perceive(rule, i, at, densityCount) {
     const { width, dimension, channels, rows, sums, states, kernels } = this;
     kernels.listNeighbours(this, i);
     kernels.sumNeighbours(this, i);
@@ -420,7 +416,7 @@ export class Physics {
         );
       }
     }
-    const densityScale = scale ** (1 + dimension) / divisor;
+    const densityScale = scale ** (1 + dimension) / densityCount;
     if (rule.density_gradient) {
       to = logScaled(
         rows, to, dimension,

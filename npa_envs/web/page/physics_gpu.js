@@ -6,6 +6,7 @@ import { CELLS_PER_RADIUS, MAX_CELLS, MOMENT_THRESHOLD, SQUARED_MOMENT_SOFTENING
 
 const GROUP = 64;
 const UNIFORM_BYTES = 96;
+const SPAN = 2 * CELLS_PER_RADIUS + 1;
 
 // Returns a device of the browser, or null.
 export async function openDevice() {
@@ -13,22 +14,17 @@ export async function openDevice() {
   return adapter ? adapter.requestDevice() : null;
 }
 
-// Code that visits all j in the cells around sorted particle i: d is the vector to j, square its squared length.
-function visitNeighbours(body) {
-  const span = CELLS_PER_RADIUS;
-  return `
+// Pieces of shaders, in WGSL. Cells around that of sorted particle i: `counts` along each axis, from cell `first` on.
+const CELLS_AROUND = `
     let own = points[i].xyz;
     let cell = home[i];
     let at = vec3u(cell % world.cells.x, (cell / world.cells.x) % world.cells.y, cell / (world.cells.x * world.cells.y));
-    let counts = min(world.cells.xyz, vec3u(${2 * span + 1}));
+    let counts = min(world.cells.xyz, vec3u(${SPAN}));
     // In a small box each cell is visited once.
-    let first = select(at + world.cells.xyz - vec3u(${span}), vec3u(0), counts < vec3u(${2 * span + 1}));
-    for (var cz = 0u; cz < counts.z; cz++) {
-      for (var cy = 0u; cy < counts.y; cy++) {
-        for (var cx = 0u; cx < counts.x; cx++) {
-          let there = (first + vec3u(cx, cy, cz)) % world.cells.xyz;
-          let number = (there.z * world.cells.y + there.y) * world.cells.x + there.x;
-          for (var j = starts[number]; j < starts[number + 1]; j++) {
+    let first = select(at + world.cells.xyz - vec3u(${CELLS_PER_RADIUS}), vec3u(0), counts < vec3u(${SPAN}));`;
+
+// The vector d to particle j, its squared length, and the smoothing kernel w and slope k there.
+const KERNELS = `
             var d = points[j].xyz - own;
             d -= world.sides.xyz * round(d * world.per.xyz);
             let square = dot(d, d);
@@ -36,7 +32,17 @@ function visitNeighbours(body) {
             let left = world.eps * world.eps - square;
             let length = sqrt(square);
             let w = world.weight * left * left * left;
-            let k = select(0.0, world.slope * (world.eps - length) * (world.eps - length) / length, square > 0.0);
+            let k = select(0.0, world.slope * (world.eps - length) * (world.eps - length) / length, square > 0.0);`;
+
+// Visits all neighbours j of sorted particle i.
+function visitNeighbours(body) {
+  return `${CELLS_AROUND}
+    for (var cz = 0u; cz < counts.z; cz++) {
+      for (var cy = 0u; cy < counts.y; cy++) {
+        for (var cx = 0u; cx < counts.x; cx++) {
+          let there = (first + vec3u(cx, cy, cz)) % world.cells.xyz;
+          let number = (there.z * world.cells.y + there.y) * world.cells.x + there.x;
+          for (var j = starts[number]; j < starts[number + 1]; j++) {${KERNELS}
             ${body}
           }
         }
@@ -44,28 +50,36 @@ function visitNeighbours(body) {
     }`;
 }
 
-// Code that writes L(∇s) of all channels, from the sums `slopes` and the moment matrix, to `z`.
+// The adjugate and the determinant of the moment matrix, by the dimension.
+const ADJUGATES = {
+  2: "let adjugate = array<f32, 6>(yy, -xy, 0.0, xx, 0.0, 0.0); let determinant = xx * yy - xy * xy;",
+  3: `let adjugate = array<f32, 6>(yy * zz - yz * yz, xz * yz - xy * zz, xy * yz - xz * yy,
+        xx * zz - xz * xz, xy * xz - xx * yz, xx * yy - xy * xy);
+      let determinant = xx * adjugate[0] + xy * adjugate[1] + xz * adjugate[2];`,
+};
+
+// The moment matrix's inverse m from both, by NPARule's `moment_inverse`.
+const INVERSES = {
+  smooth: `
+      let divisor = determinant * determinant + ${SQUARED_MOMENT_SOFTENING};
+      for (var k = 0; k < 6; k++) { m[k] = (determinant * adjugate[k] + ${SQUARED_MOMENT_SOFTENING} * m[k]) / divisor; }`,
+  threshold: `
+      if (abs(determinant) >= ${MOMENT_THRESHOLD}) { for (var k = 0; k < 6; k++) { m[k] = adjugate[k] / determinant; } }`,
+};
+
+// Writes the components of v along the axes to `z`.
+const writeVector = (axes) => axes.map((axis) => `z[to] = v.${axis}; to++;`).join(" ");
+
+// Writes L(∇s) of all channels, from the sums `slopes` and the moment matrix, to `z`.
 function stateGradient(rule, axes) {
-  const inverse = {
-    2: "let adjugate = array<f32, 6>(yy, -xy, 0.0, xx, 0.0, 0.0); let determinant = xx * yy - xy * xy;",
-    3: `let adjugate = array<f32, 6>(yy * zz - yz * yz, xz * yz - xy * zz, xy * yz - xz * yy,
-          xx * zz - xz * xz, xy * xz - xx * yz, xx * yy - xy * xy);
-        let determinant = xx * adjugate[0] + xy * adjugate[1] + xz * adjugate[2];`,
-  }[axes.length];
-  const corrected = rule.moment_inverse === "smooth"
-    ? `let divisor = determinant * determinant + ${SQUARED_MOMENT_SOFTENING};
-       for (var k = 0; k < 6; k++) { m[k] = (determinant * adjugate[k] + ${SQUARED_MOMENT_SOFTENING} * m[k]) / divisor; }`
-    : `if (abs(determinant) >= ${MOMENT_THRESHOLD}) {
-         for (var k = 0; k < 6; k++) { m[k] = adjugate[k] / determinant; }
-       }`;
   return `
     var m = array<f32, 6>(1.0, 0.0, 0.0, 1.0, 0.0, 1.0);
-    ${rule.moment_correction ? `{ ${inverse} ${corrected} }` : ""}
+    ${rule.moment_correction ? `{ ${ADJUGATES[axes.length]} ${INVERSES[rule.moment_inverse]} }` : ""}
     for (var c = 0u; c < CHANNELS; c++) {
       let g = slopes[c];
       let v = logScaled(world.scale * vec3f(
         g.x * m[0] + g.y * m[1] + g.z * m[2], g.x * m[1] + g.y * m[3] + g.z * m[4], g.x * m[2] + g.y * m[4] + g.z * m[5]));
-      ${axes.map((axis) => `z[to] = v.${axis}; to++;`).join(" ")}
+      ${writeVector(axes)}
     }`;
 }
 
@@ -140,7 +154,7 @@ function advanceShader({ state_dim: channels, inputs, outputs, ...rule }) {
     ${rule.state_gradient ? stateGradient(rule, axes) : ""}
     ${rule.density_gradient ? `{
       let v = logScaled(world.densityScale * fields[i].xyz);
-      ${axes.map((axis) => `z[to] = v.${axis}; to++;`).join(" ")}
+      ${writeVector(axes)}
     }` : ""}
     var y: array<f32, ${outputs}>;
     for (var h = 0u; h < HIDDEN; h++) {
@@ -160,8 +174,7 @@ export class GpuPhysics {
   static async make(device, physics) {
     for (const kind of ["out-of-memory", "validation"]) device.pushErrorScope(kind);
     const gpu = new GpuPhysics(device, physics);
-    const errors = [await device.popErrorScope(), await device.popErrorScope()];
-    const error = errors.find((entry) => entry !== null);
+    const error = [await device.popErrorScope(), await device.popErrorScope()].find((entry) => entry !== null);
     if (error) throw Error(error.message);
     return gpu;
   }
@@ -190,8 +203,7 @@ export class GpuPhysics {
     const layout = device.createBindGroupLayout({ entries: types.map((type, k) => entry(k, type)) });
     const pipelines = device.createPipelineLayout({ bindGroupLayouts: [layout] });
     this.species = rules.map((rule) => {
-      const outputs = rule.outputs;
-      const module = device.createShaderModule({ code: shaders({ ...rule, width }) });
+      const { outputs } = rule, module = device.createShaderModule({ code: shaders({ ...rule, width }) });
       const pipeline = (entryPoint) => device.createComputePipeline({ layout: pipelines, compute: { module, entryPoint } });
       const matrices = [rule.weights["hidden.weight"], rule.weights["hidden.bias"], rule.weights["output.weight"]];
       const weights = buffer(matrices.reduce((size, matrix) => size + matrix.byteLength, 0), input);
@@ -210,8 +222,7 @@ export class GpuPhysics {
   }
 
   async step(world, { eps, box = null, mask = null, noise = null, densityCounts = null }) {
-    const { physics, device, packedPoints, packedHome } = this;
-    const { count } = world;
+    const { physics, device, packedPoints, packedHome } = this, { count } = world;
     physics.sort(world, eps, box);
     const { points, order, starts, cells, dimension, width } = physics;
     const total = cells[0] * cells[1] * cells[2];
@@ -234,8 +245,7 @@ export class GpuPhysics {
       for (let k = 0; k < count; k++) {
         if (world.species[order[k]] === number && (mask === null || mask[order[k]] !== 0)) active.push(k);
       }
-      const divisor = densityCounts === null ? count : densityCounts[number];
-      write(entry.world, uniforms(physics, entry.rule, count, active.length, divisor));
+      write(entry.world, uniforms(physics, entry.rule, count, active.length, densityCounts?.[number] ?? count));
       write(entry.active, Uint32Array.from(active));
       pass.setBindGroup(0, entry.group);
       if (number === 0) {
@@ -268,14 +278,14 @@ export class GpuPhysics {
   }
 }
 
-function uniforms({ sides, perSide, cells, dimension, eps, weight, slope }, rule, count, rows, divisor) {
+function uniforms({ sides, perSide, cells, dimension, eps, weight, slope }, rule, count, rows, densityCount) {
   const bytes = new ArrayBuffer(UNIFORM_BYTES);
   const floats = new Float32Array(bytes), integers = new Uint32Array(bytes);
   floats.set(sides);
   floats.set(perSide, 4);
   integers.set(cells, 8);
   const scale = eps / rule.eps0;
-  floats.set([eps, weight, slope, scale, scale ** (1 + dimension) / divisor], 12);
+  floats.set([eps, weight, slope, scale, scale ** (1 + dimension) / densityCount], 12);
   integers.set([count, rows], 18);
   return floats;
 }

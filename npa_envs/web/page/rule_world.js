@@ -1,7 +1,7 @@
 // The world of an exported page, which follows RuleWorld of npa_envs/web/rule_world.py. npa_envs/web/messages.py has
 // its messages and events.
 
-import { clump, cut, wipeState, inject, insideBall, push, stateAround } from "./brushes.js";
+import { clump, cut, cutAlong, wipeState, inject, insideBall, push, stateAround } from "./brushes.js";
 import { Colouring, RuleColours } from "./colours.js";
 import { fastestKernels } from "./kernels_simd.js";
 import { padded, Physics, prepareRule, wrap } from "./physics.js";
@@ -15,7 +15,8 @@ const TRIAL_STEPS = 4;
 const TRIAL_TOLERANCE = 1e-3;
 
 // What brushes do, by the names of `BRUSHES` of npa_envs/web/messages.py: functions of a RuleWorld and a message
-// "brush", whose `strength` has become an `amount`.
+// "brush", whose `strength` has become an `amount`. tests/web/test_export.py compares them with RuleWorld's:
+// test_brushes_of_a_page_are_those_of_the_viewer.
 const BRUSHES = {
   remove(live, { at, radius }) {
     const removed = new Set(insideBall(live.world, at, radius));
@@ -26,11 +27,7 @@ const BRUSHES = {
   },
   push: ({ world }, { at, move, radius, amount }) => push(world, at, move, radius, amount),
   clump: ({ world }, { at, radius, amount }) => clump(world, at, radius, amount),
-  cut({ world, dimension }, { at, move, radius, view }) {
-    const half = move.map((component) => component / 2);
-    const normal = cross(view ?? [0, 0, 1], [move[0], move[1], move[2] ?? 0]).slice(0, dimension);
-    cut(world, at.map((coordinate, d) => coordinate + half[d]), normal, radius, half);
-  },
+  cut: ({ world }, { at, move, radius, view }) => cutAlong(world, at, move, radius, view ?? [0, 0, 1]),
   inject({ world }, { at, radius, amount, source }) {
     const state = stateAround(world, source ?? at, radius);
     if (state !== null) inject(world, at, radius, state, amount);
@@ -57,7 +54,7 @@ const BRUSHES = {
 };
 
 // What the kinds of damage do, as `damage_worlds` of npa_envs/tasks/damage.py: functions of a RuleWorld, the kind's
-// size [length units], and the position of a random particle.
+// size [length units], and the position of a random particle. tests/web/test_export.py checks how far particles move.
 const DAMAGES = {
   wipe: ({ world }, size, centre) => wipeState(world, centre, size),
   cut: ({ world, random }, size) => cut(world, meanOf(world), random.direction(world.dimension), size),
@@ -73,8 +70,7 @@ export class RuleWorld {
     this.device = device;
     this.engine = settings.engine ?? "auto";
     this.rules = settings.rules.map(decoded);
-    this.colourTables = {};
-    for (const [name, text] of Object.entries(settings.colours)) this.colourTables[name] = bytesOf(text);
+    this.colourTables = mapped(settings.colours, bytesOf);
     this.constants = settings.constants;
     this.send = send;
     this.playing = true;
@@ -97,8 +93,7 @@ export class RuleWorld {
     this.dimension = rule.space_dim;
     this.channels = rule.state_dim;
     this.box = rule.world.box;
-    this.values = {};
-    for (const [name, { value }] of Object.entries(rule.world.settings)) this.values[name] = value;
+    this.values = mapped(rule.world.settings, ({ value }) => value);
     this.values.count ??= rule.world.count;
     if (!rule.world.shows.includes(this.show)) this.show = "colours";
     this.reset(this.seed);
@@ -113,8 +108,8 @@ export class RuleWorld {
     // Each species divides densities by the particles of a newly seeded world: particles that a brush adds or
     // removes change only the densities around them.
     this.seedCount = this.values.count;
-    this.divisors = [this.seedCount];
-    this.colouring = new Colouring(this.colourTables);
+    this.densityCounts = [this.seedCount];
+    this.colouring = new Colouring(this.colourTables, this.constants);
     this.setParticles(this.seedPositions(), new Float32Array(this.seedCount * this.channels), new Uint8Array(this.seedCount));
     this.prepare();
     this.announce();
@@ -142,7 +137,7 @@ export class RuleWorld {
   prepare() {
     const kernels = (this.kernels = fastestKernels(padded(this.channels), this.dimension));
     this.physics = new Physics(this.species.map((rule) => prepareRule(rule, kernels)), this.world.count, kernels);
-    this.ruleColours = this.species.map((rule) => new RuleColours(rule, kernels));
+    this.ruleColours = this.species.map((rule) => new RuleColours(rule, kernels, this.constants.COLOUR_OFFSET));
     this.gpu?.close();
     this.gpu = null;
     // Steps that are left of the trial, and the shortest time of a step on each [ms].
@@ -178,13 +173,12 @@ export class RuleWorld {
 
   async step() {
     const started = performance.now();
-    const { world, random, values, dimension, box, updated } = this;
+    const { world, random, values, dimension, box, updated, densityCounts, values: { eps } } = this;
     if (world.count > 0) {
       const before = world.x.slice();
       for (let i = 0; i < world.count; i++) updated[i] = random.uniform() < values.update_prob ? 1 : 0;
       const noise = values.noise > 0 ? random.normals(world.x.length, values.noise) : null;
-      const { eps } = values;
-      await this.compute({ eps, box, mask: updated, noise, densityCounts: this.divisors });
+      await this.compute({ eps, box, mask: updated, noise, densityCounts });
       const longest = eps * Math.max(...this.species.map((rule) => rule.alpha));
       for (let i = 0; i < world.count; i++) {
         let square = 0;
@@ -248,7 +242,7 @@ export class RuleWorld {
   }
 
   // Returns the index of a rule's species; a rule that is new in the world is appended.
-  speciesOf(name, divisor) {
+  speciesOf(name, densityCount) {
     const rule = this.ruleNamed(name);
     const index = this.species.indexOf(rule);
     if (index >= 0) return index;
@@ -257,7 +251,7 @@ export class RuleWorld {
       throw Error(`${name} cannot live in a world of ${this.rule.name}: rules of one world must agree in ${fields}`);
     }
     this.species.push(rule);
-    this.divisors.push(divisor);
+    this.densityCounts.push(densityCount);
     this.prepare();
     this.announce();
     return this.species.length - 1;
@@ -304,8 +298,7 @@ export class RuleWorld {
   announce() {
     const { rule, values, show, playing, seed } = this;
     const { settings: ranges, ...world } = rule.world;
-    const settings = {};
-    for (const [name, range] of Object.entries(ranges)) settings[name] = { ...range, value: values[name] };
+    const settings = mapped(ranges, (range, name) => ({ ...range, value: values[name] }));
     this.changed = true;
     const names = (rules) => rules.map(({ name }) => name);
     this.send({
@@ -344,18 +337,17 @@ function meanOf({ x, dimension }) {
   return mean;
 }
 
-function cross(a, b) {
-  return [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
-}
-
 // Returns a rule with its weights and clouds as arrays of numbers.
 function decoded(rule) {
   const floats = (text) => new Float32Array(bytesOf(text).buffer);
-  const weights = {};
-  for (const [name, text] of Object.entries(rule.weights)) weights[name] = floats(text);
-  const { seed } = rule.world;
+  const { weights, world: { seed } } = rule;
   const world = seed.clouds ? { ...rule.world, seed: { ...seed, clouds: seed.clouds.map(floats) } } : rule.world;
-  return { ...rule, weights, world };
+  return { ...rule, weights: mapped(weights, floats), world };
+}
+
+// Returns an object of the same names whose values are `change` of the value and its name.
+function mapped(object, change) {
+  return Object.fromEntries(Object.entries(object).map(([name, value]) => [name, change(value, name)]));
 }
 
 function bytesOf(text) {
