@@ -15,7 +15,7 @@ import pytest
 import torch
 from PIL import Image
 
-from npa_envs.cli import COMMANDS, demo, doctor, main
+from npa_envs.cli import COMMANDS, common, demo, doctor, main
 from npa_envs.cli.train import announcement, parse_run, starting_configuration
 from npa_envs.errors import NPAError
 from npa_envs.render.world_film import WorldFilm
@@ -269,8 +269,9 @@ def test_train_says_what_it_learns_and_writes_a_rule_that_loads(tmp_path, capsys
 )
 def test_runs_that_name_no_preset_take_the_best_one_on_cuda_and_the_fast_one_elsewhere(words, name):
     task, *rest = words.split()
-    assert starting_configuration(task, rest) == preset(name, task)
-    options, config = parse_run(task, rest)
+    first = common.first_options(rest)
+    assert starting_configuration(task, first) == preset(name, task)
+    options, config = parse_run(task, first)
     assert announcement(task, options, config)[0].endswith(f"(preset {name})")
 
 
@@ -278,10 +279,12 @@ def test_a_configuration_file_goes_over_the_preset_and_options_over_the_file(tmp
     path = tmp_path / "run.yaml"
     path.write_text("preset: tiny\nlearning_rate: 0.125\nparticle_count: 77\nseed: 5\n", "utf-8")
     words = ["--config", str(path)]
-    _, config = parse_run("morphogenesis2d", [*words, "--seed", "6", "--eps", "0.25"])
+    first = common.first_options([*words, "--seed", "6", "--eps", "0.25"])
+    config = parse_run("morphogenesis2d", first)[1]
     assert (config.iterations, config.learning_rate, config.seed) == (40, 0.125, 6)
     assert (config.task.particle_count, config.task.eps) == (77, 0.25)
-    config = starting_configuration("morphogenesis2d", [*words, "--preset", "fast"])
+    first = common.first_options([*words, "--preset", "fast"])
+    config = starting_configuration("morphogenesis2d", first)
     assert (config.iterations, config.seed) == (preset("fast").iterations, 5)
     path.write_text("preset: tinny\n", encoding="utf-8")
     assert "did you mean 'tiny'" in error_of(capsys, ["train", "morphogenesis2d", *words])
