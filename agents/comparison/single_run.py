@@ -205,7 +205,7 @@ def final_picture(
 
 
 def main(folder: Path) -> None:
-    """Load the libraries that the run in `folder` needs; do each run that standard input orders."""
+    """Import what the run in `folder` needs; then do runs named on standard input, one a line."""
     orders: SimpleQueue[tuple[str, str, str]] = SimpleQueue()
 
     def listen() -> None:

@@ -45,7 +45,7 @@ KL_FACTOR = 1.5
 
 @dataclass(frozen=True, kw_only=True)
 class WorldOptions(CommonOptions):
-    """Options of PPO with one likelihood for each world."""
+    """Options of PPO whose sample is a world's joint action: one likelihood ratio per world."""
 
     clip: float = 0.02
     """Likelihood ratios are clipped to 1 ± this (dimensionless); it is small, as log-ratios are

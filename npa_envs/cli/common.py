@@ -206,7 +206,7 @@ def check_numbers(options: Any, **least: int) -> None:
 
 
 def named_values(name: str, arguments: Iterable[str]) -> dict[str, Any]:
-    """Return values by NAME of arguments NAME=VALUE; each is read as JSON, or else stays text.
+    """Parse arguments NAME=VALUE to values by name; a value is read as JSON, or else stays text.
 
     `name` is the option that has these arguments, for errors.
     """
