@@ -33,7 +33,7 @@ NEARLY_FULL_BYTES = 64 * 1024
 
 
 def checked_path(path: str | Path) -> Path:
-    """Return `path` as a pathlib.Path; raise NPAError if it is no text or has null characters."""
+    """Return text or a path as a pathlib.Path; raise NPAError for others and null characters."""
     if not isinstance(path, str | os.PathLike):
         raise NPAError(f"a path must be text or a pathlib.Path, got {shown(path)}")
     try:

@@ -135,7 +135,7 @@ def parse_device(name: str) -> torch.device:
 
 
 def check_device(name: str | torch.device) -> torch.device:
-    """Return the torch.device called `name`, if CUDA with its number; torch must see it."""
+    """Return a torch.device, for "cuda" cuda:0; raise NPAError if torch has no such device."""
     device = parse_device(str(name) if isinstance(name, torch.device) else name)
     if device.type != "cuda":
         return device

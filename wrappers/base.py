@@ -117,7 +117,7 @@ def check_tensor(values: Any, wrapper: str) -> None:
 
 
 def world_indices(mask: NDArray[np.bool_], device: torch.device) -> Tensor:
-    """Return the indices of the M worlds at which a mask [B] is True, int64, shape [M]."""
+    """Return the indices of the B' worlds at which a mask [B] is True, int64, shape [B']."""
     return torch.from_numpy(np.flatnonzero(mask)).to(device)
 
 
@@ -241,7 +241,7 @@ class ChangesObservations:
     """Mixin of wrappers that change observations, of one world or many."""
 
     def update(self, observations: Any) -> None:
-        """Add new observations, [N, P] or [M, N, P], to the wrapper's statistics."""
+        """Add new observations, [N, P] or [B', N, P], to the wrapper's statistics."""
 
     @abstractmethod
     def changed(self, observations: Any) -> Any:
@@ -258,7 +258,7 @@ class Observations(ChangesObservations, AnyObservationWrapper):
 
 
 class EpisodeWrapper(AnyVectorWrapper):
-    """Base class of wrappers of vector environments with an `EpisodeClock`."""
+    """Base of vector wrappers: override `after_reset` and `after_step`; `clock` counts steps."""
 
     def __init__(self, env: AnyVectorEnv) -> None:
         if not isinstance(env, VectorEnv):

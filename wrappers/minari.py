@@ -182,7 +182,7 @@ def spec_of(env_id: str, keywords: dict[str, Any], episode_steps: int) -> EnvSpe
 
 
 def read_pairs(dataset_id: str) -> tuple[Tensor, Tensor]:
-    """Return the observations and actions of all W steps of a dataset, float32, [W, ...] each."""
+    """Return the observations and actions of all steps of a dataset, float32, [steps, ...] each."""
     try:
         dataset = minari.load_dataset(dataset_id)
     except (FileNotFoundError, ValueError) as error:

@@ -120,7 +120,7 @@ class _PerceptionNormalizer(WrapperBase):
         self.statistics.load_state_dict(state)
 
     def update(self, observations: Any) -> None:
-        """Add new observations, [N, P] or [M, N, P], to the statistics if `training` is True."""
+        """Add new observations, [N, P] or [B', N, P], to the statistics if `training` is True."""
         if not self.training:
             return
         z = as_tensor(observations).flatten(0, -2)
@@ -145,7 +145,7 @@ class _PerceptionNormalizer(WrapperBase):
         return normal if isinstance(observations, Tensor) else normal.numpy()
 
     def _spread(self, statistics: Tensor) -> Tensor:
-        """Repeat statistics [3 C + 1] for the components of gradients, to shape [P]."""
+        """Repeat statistics [3 C + 1], one for each gradient, for its D components: shape [P]."""
         centred = 2 * self._physics.state_dim
         gradients = statistics[centred:].repeat_interleave(self._physics.space_dim)
         return torch.cat((statistics[:centred], gradients))

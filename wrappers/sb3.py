@@ -80,7 +80,7 @@ class RowVecEnv(VecEnv):
 
     @abstractmethod
     def _row_observations(self, observations: Any) -> Any:
-        """Return rows' observations [M R, ...] for the observations of M worlds, all or some."""
+        """Return rows' observations [B' R, ...] for the observations of B' worlds, all or some."""
 
     def step_async(self, actions: NDArray[Any]) -> None:
         """Store the actions of all rows, shape [B R, A], for `step_wait`."""
@@ -95,9 +95,9 @@ class RowVecEnv(VecEnv):
         return actions
 
     def infos(self, rows: NDArray[np.int64], entries: Mapping[str, Any]) -> list[dict[str, Any]]:
-        """Return the info of each row: the empty one, except in the M rows of index `rows`.
+        """Return the info of each row: the empty one, except in the rows of index `rows`.
 
-        Each of their `entries` has M values, one for each of these rows.
+        Each of their `entries` has one value for each of these rows.
         """
         infos: list[dict[str, Any]] = [self.shared_info] * self.num_envs
         for k, row in enumerate(rows.tolist()):

@@ -203,7 +203,7 @@ def final_picture(
 
 
 def main(folder: Path) -> None:
-    """Import what the run in `folder` needs; do the run that each line of standard input orders."""
+    """Import what the run in `folder` needs; then do runs named on standard input, one a line."""
     orders: SimpleQueue[tuple[str, str, str]] = SimpleQueue()
 
     def listen() -> None:

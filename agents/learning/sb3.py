@@ -44,7 +44,7 @@ KL_FACTOR = 1.5
 
 @dataclass(frozen=True, kw_only=True)
 class WorldOptions(CommonOptions):
-    """Options of PPO with one likelihood ratio for each world, that of its joint action."""
+    """Options of PPO whose sample is a world's joint action: one likelihood ratio per world."""
 
     clip: float = 0.02
     """Likelihood ratios, of means over many particles, are clipped to 1 ± this (dimensionless)."""

@@ -14,9 +14,9 @@ from npa_envs.errors import NPAError, suggest
 GROUPS = {
     "make": {
         "demo": "grow a shipped rule, damage it, let it heal; train a small one: a minute on a CPU",
-        "train": "a picture, texture or class as target: train a rule by the gradient of its loss",
+        "train": "with a target (picture, texture, class): train a rule by the loss's gradient",
         "sweep": "train with every combination of some options, over devices and machines",
-        "search": "search for rules that differ from each other and stay alive; an archive of them",
+        "search": "without a target: search for rules that differ from each other and stay alive",
     },
     "look": {
         "view": "watch a rule, a training run or an environment in the browser, with brushes",
@@ -25,8 +25,8 @@ GROUPS = {
         "list": "list tasks, presets, environments, targets, losses and shipped rules",
     },
     "learn": {
-        "learn": "an environment's reward as target: learn by PPO or SHAC, on one GPU or several",
-        "compare": "compare reinforcement learning, evolution and the gradient on equal tasks",
+        "learn": "with an environment's reward: learn a policy by PPO or SHAC, on one or more GPUs",
+        "compare": "to choose a method: PPO, SHAC, evolution and the gradient on equal tasks",
         "record-dataset": "write episodes of a policy as a Minari dataset",
     },
     "measure": {

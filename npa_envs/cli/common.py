@@ -206,7 +206,7 @@ def check_numbers(options: Any, **least: int) -> None:
 
 
 def named_values(name: str, arguments: Iterable[str]) -> dict[str, Any]:
-    """Return values by NAME of arguments NAME=VALUE; each is read as JSON, or else stays text.
+    """Parse arguments NAME=VALUE to values by name; a value is read as JSON, or else stays text.
 
     `name` is the option that has these arguments, for errors.
     """
@@ -235,9 +235,9 @@ def problem_of(options: Any, num_envs: int, steps: int | None = None) -> Problem
 
 
 def first_options(arguments: Sequence[str]) -> argparse.Namespace:
-    """Parse only the options that decide the defaults of others, such as `--preset`.
+    """Return the options that choose the defaults of others, such as `preset`, and all `words`.
 
-    By argparse: tyro, which parses all options, takes the defaults first.
+    tyro parses all options, but needs the defaults before.
     """
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
     for name in ("preset", "device", "gpus"):
@@ -247,34 +247,36 @@ def first_options(arguments: Sequence[str]) -> argparse.Namespace:
     parser.add_argument("--resume", nargs="?", const=True, choices=("auto",))
     parser.add_argument("--overwrite", action="store_true")
     try:
-        return parser.parse_known_args(arguments)[0]
+        return parser.parse_known_args(arguments, argparse.Namespace(words=[*arguments]))[0]
     except argparse.ArgumentError as error:
         raise NPAError(f"{error.argument_name}: {error.message}") from error
 
 
-def resolve_run(arguments: Sequence[str], out_of: Callable[[Sequence[str]], Path]) -> list[str]:
-    """Return a run's arguments with `--device cuda` if `--gpus` is given without a device.
+def resolve_run(arguments: Sequence[str], out_of: Callable[[Any], Path]) -> argparse.Namespace:
+    """Return `first_options`, with `--device cuda` if `--gpus` is given without a device.
 
     `--resume auto` becomes `--resume` if there is a checkpoint in the run's folder; otherwise it is
-    removed. `out_of` returns that folder for arguments.
+    removed. `out_of` returns that folder for these options.
     """
     first = first_options(arguments)
-    resolved = list(arguments)
     if first.gpus is not None and first.device is None:
-        resolved += ["--device", "cuda"]
+        first.device = "cuda"
+        first.words += ["--device", "cuda"]
     if first.resume is not None:
         from npa_envs.training.run_folder import RunFolder, check_choice
 
         check_choice(resume=True, overwrite=first.overwrite)
         if first.resume == "auto":
-            if "--resume=auto" in resolved:
-                resolved.remove("--resume=auto")
+            if "--resume=auto" in first.words:
+                first.words.remove("--resume=auto")
             else:
-                index = resolved.index("--resume")
-                del resolved[index : index + 2]
-            if RunFolder(out_of(resolved)).checkpoint.exists():
-                resolved.append("--resume")
-    return resolved
+                index = first.words.index("--resume")
+                del first.words[index : index + 2]
+            first.resume = None
+            if RunFolder(out_of(first)).checkpoint.exists():
+                first.resume = True
+                first.words.append("--resume")
+    return first
 
 
 def chosen_names(noun: str, names: Sequence[str], known: Iterable[str]) -> list[str]:

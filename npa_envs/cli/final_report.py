@@ -1,4 +1,4 @@
-"""The last part of `npa-envs train`: measures and films the trained rule, writes its model card."""
+"""No command: the end of `npa-envs train`, which measures and films the rule; its model card."""
 
 from __future__ import annotations
 

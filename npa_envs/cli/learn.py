@@ -72,7 +72,7 @@ def main(arguments: Sequence[str]) -> int:
     with joined_processes() as processes:
         request = None
         if processes.first:
-            resolved = common.resolve_run(arguments, lambda words: parse(words).out)
+            resolved = common.resolve_run(arguments, lambda first: parse(first.words).out).words
             request = resolved, parse(resolved)
         request = processes.broadcast(request)
         assert request is not None, "broadcast by the first process"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import math
 import shlex
 from collections.abc import Sequence
@@ -69,12 +70,16 @@ class TrainOptions(common.SharedRunOptions):
     """End with a report in the folder `out`: metrics, a film and a model card of the rule."""
 
 
-def parse_run(task_name: str, arguments: Sequence[str]) -> tuple[TrainOptions, TrainConfig[Any]]:
-    """Parse arguments to the options of the run and its training configuration.
+def parse_run(task_name: str, first: argparse.Namespace) -> tuple[TrainOptions, TrainConfig[Any]]:
+    """Parse all words of `first_options` to the run's options and its training configuration.
 
     Ends the process after `--help`, which shows the most used options, and `--help-all`.
     """
-    return _parse_over(starting_configuration(task_name, arguments), task_name, arguments)
+    base = starting_configuration(task_name, first)
+    options, config = _parse_over(base, task_name, first.words)
+    if first.resume and first.preset and first.config is None:
+        _check_preset(first, base, config, task_name)
+    return options, config
 
 
 def _parse_over(base: Any, task_name: str, arguments: Sequence[str]) -> tuple[TrainOptions, Any]:
@@ -89,15 +94,11 @@ def default_preset(task_name: str, device: str) -> str:
     return "best" if cuda and "best" in task_entry(task_name).presets else "fast"
 
 
-def starting_configuration(task_name: str, arguments: Sequence[str]) -> TrainConfig[Any]:
-    """Return the configuration of the preset, file or resumed run that `arguments` name.
-
-    Other options have not changed it yet.
-    """
-    first = common.first_options(arguments)
+def starting_configuration(task_name: str, first: argparse.Namespace) -> TrainConfig[Any]:
+    """Return the preset, file or resumed run that `first` names, before other options change it."""
     device = first.device if first.device and first.config is None else "cpu"
     base = preset(first.preset or default_preset(task_name, device), task_name)
-    if first.resume and not {"-h", "--help", "--help-all"} & set(arguments):
+    if first.resume and not {"-h", "--help", "--help-all"} & set(first.words):
         folder = RunFolder(first.out or base.out)
         if not folder.checkpoint.is_file():
             raise NPAError(
@@ -110,8 +111,6 @@ def starting_configuration(task_name: str, arguments: Sequence[str]) -> TrainCon
             # The run may be of another task, whose fields are unknown: report that instead.
             check_task(load_checkpoint(folder.checkpoint), task_name, folder.checkpoint)
             raise
-        if first.preset and first.config is None:
-            _check_preset(first.preset, base, task_name, folder, arguments)
     if first.config is not None:
         presets = task_entry(task_name).presets
         if first.preset or first.resume:
@@ -122,14 +121,13 @@ def starting_configuration(task_name: str, arguments: Sequence[str]) -> TrainCon
 
 
 def _check_preset(
-    name: str, run: TrainConfig[Any], task_name: str, folder: RunFolder, arguments: Sequence[str]
+    first: argparse.Namespace, run: TrainConfig[Any], parsed: TrainConfig[Any], task_name: str
 ) -> None:
-    """Raise NPAError if the run to resume is not of the preset `name`, except for given options."""
-    presets = task_entry(task_name).presets
+    """Raise NPAError if `run` is not of the preset; options given, as in `parsed`, may differ."""
+    name, presets = first.preset, task_entry(task_name).presets
     # A given option has the same value over the run as over the preset.
-    over_run, over_preset = (
-        config_to_dict(_parse_over(base, task_name, arguments)[1]) for base in (run, presets[name])
-    )
+    of_preset = _parse_over(presets[name], task_name, first.words)[1]
+    over_run, over_preset = config_to_dict(parsed), config_to_dict(of_preset)
     values, *of_presets = map(config_to_dict, (run, *presets.values()))
     others = [
         f"{key}: {shown(values.get(key))}"
@@ -139,9 +137,10 @@ def _check_preset(
         and any(preset_values.get(key) != value for preset_values in of_presets)
     ]
     if others:
+        folder = shown(str(first.out or presets[name].out))
         raise NPAError(
-            f"preset must be the one that the run in {shown(str(folder.path))} was begun with, "
-            f"but {name!r} differs from it ({', '.join(others)} there): leave --preset out"
+            f"preset must be the one that the run in {folder} was begun with, but "
+            f"{name!r} differs from it ({', '.join(others)} there): leave --preset out"
         )
 
 
@@ -272,10 +271,10 @@ def main(arguments: Sequence[str]) -> int:
     with joined_processes() as processes:
         request = None
         if processes.first:
-            resolved = common.resolve_run(
-                options_given, lambda words: parse_run(task_name, words)[1].out
+            first = common.resolve_run(
+                options_given, lambda first: parse_run(task_name, first)[1].out
             )
-            request = resolved, *parse_run(task_name, resolved)
+            request = first.words, *parse_run(task_name, first)
         # Only the first process reads files, so that all have the same configuration.
         request = processes.broadcast(request)
         assert request is not None, "broadcast by the first process"
@@ -394,9 +393,8 @@ def process_count(task_name: str, options: TrainOptions, config: TrainConfig[Any
     idle = thread_count(config) < torch.get_num_threads() and dist.is_available()
     if not idle or seconds is None or seconds < 60.0:
         return 1
-    if options.resume and not has_per_world_streams(
-        load_checkpoint(RunFolder(config.out).checkpoint)
-    ):
+    checkpoint = RunFolder(config.out).checkpoint
+    if options.resume and not has_per_world_streams(load_checkpoint(checkpoint)):
         return 1
     try:
         ProcessGroup(0, 2).check(config)

@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from npa_envs.cli import main
+from npa_envs.cli import common, main
 from npa_envs.cli.train import parse_run
 from npa_envs.errors import NPAError
 from npa_envs.rule.files import load_rule, rule_metadata
@@ -19,7 +19,7 @@ TINY += ["--iterations", "4"]
 
 
 def parsed(*words):
-    return parse_run("co_morphogenesis2d", words)[1]
+    return parse_run("co_morphogenesis2d", common.first_options(words))[1]
 
 
 def test_options_are_those_of_all_species():

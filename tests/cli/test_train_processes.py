@@ -7,8 +7,8 @@ import torch
 from support.circle_task import circle_config
 from support.training_runs import trainer_of
 
-from npa_envs.cli import main, train
-from npa_envs.cli.common import resolve_run, torch_threads
+from npa_envs.cli import main
+from npa_envs.cli.common import first_options, resolve_run, torch_threads
 from npa_envs.cli.train import TrainOptions, parse_run, process_count, thread_count
 from npa_envs.errors import NPAError
 from npa_envs.training import RunFolder, config_to_dict, preset
@@ -19,7 +19,7 @@ WITHOUT_AGES = {"world_count": 4, "pool_size": 30, "max_age_range": (0, 0), "sti
 
 
 def resolved(words):
-    return resolve_run(words, lambda words: parse_run(TASK, words)[1].out)
+    return resolve_run(words, lambda first: parse_run(TASK, first)[1].out).words
 
 
 def test_resume_auto_begins_and_later_goes_on(tmp_path):
@@ -76,13 +76,16 @@ def test_a_run_goes_on_with_its_own_preset_only(tmp_path):
     config = preset("fast", out=tmp_path, target="ring", iterations=9)
     (tmp_path / "checkpoint.pt").touch()
     (tmp_path / "config.json").write_text(json.dumps(config_to_dict(config)), "utf-8")
-    assert train.starting_configuration(TASK, words) == config
-    assert train.starting_configuration(TASK, [*words, "--preset=fast", "--iterations=9"]) == config
+
+    def resumed(*more):
+        return parse_run(TASK, first_options([*words, *more]))[1]
+
+    assert resumed() == config == resumed("--preset=fast", "--iterations=9")
     with pytest.raises(NPAError, match=r"'fast' differs from it \(.*iterations: 9"):
-        train.starting_configuration(TASK, [*words, "--preset", "fast", "--target", "iterations"])
+        resumed("--preset", "fast", "--target", "iterations")
     for name in ("tiny", "best"):
         with pytest.raises(NPAError, match=f"preset must be the one .* but '{name}' differs"):
-            train.starting_configuration(TASK, [*words, "--preset", name, "--iterations", "9"])
+            resumed("--preset", name, "--iterations", "9")
 
 
 def test_gpus_are_processes_that_have_a_gpu_each():

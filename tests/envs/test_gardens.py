@@ -46,7 +46,7 @@ def test_brushes_do_what_the_documentation_says():
     config = make(GARDENER, **FREE).unwrapped.config
     x = torch.tensor([[[0.0, 0.0], [0.15, 0.0], [0.5, 0.0]]])
     s, middle = torch.ones(1, 3, 16), torch.zeros(1, 2)
-    held = torch.tensor([1.0, 0.5625, 0.0])
+    held = torch.tensor([1.0, 0.5625, 0.0])  # (1 - (r / 0.3)²)² at r = 0 and 0.15; 0 beyond 0.3
     world = Particles(x, s)
     (moved, same, *_), rate = apply_brushes(world, brush(config, push=(0.0, 0.5)), middle, config)
     assert torch.allclose(moved - x, torch.stack((0.0 * held, 0.15 * held), dim=-1)[None])

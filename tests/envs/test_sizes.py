@@ -20,6 +20,12 @@ FROZEN = json.loads(Path(__file__).with_name("frozen.json").read_text(encoding="
 sizes, and of the file of the rule that runs or grows the worlds of an id, or of a target."""
 
 
+def check_frozen(part, found):
+    """Check that a part of the file has the rows `found`; say which ones a new id needs."""
+    rows = {name: digest for name, digest in found.items() if name not in FROZEN[part]}
+    assert found == FROZEN[part], f'new rows of "{part}" in frozen.json: {json.dumps(rows)}'
+
+
 def test_settings_are_what_they_were():
     now = {row.id: {"steps": row.max_episode_steps, **row.keywords} for row in SIZES}
     now |= {row.id: {"task": row.task, **row.keywords} for row in SPECIES_SIZES}
@@ -27,7 +33,7 @@ def test_settings_are_what_they_were():
         name: hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()
         for name, settings in now.items()
     }
-    assert hashes == FROZEN["sizes"]
+    check_frozen("sizes", hashes)
     for name, settings in FROZEN["gardens"].items():
         config = Problem(env_id=name, episode_steps=4).config
         found = {key: getattr(config, key) for key in settings}
@@ -51,7 +57,7 @@ def test_a_rule_that_is_trained_anew_changes_no_environment():
         for name, rule in rules.items()
         if rule != "picture"
     }
-    assert found == FROZEN["rules"]
+    check_frozen("rules", found)
 
 
 @pytest.mark.parametrize("row", [*SMALL, *SIZES], ids=lambda row: row.id)
