@@ -99,7 +99,7 @@ class Run:
         task = task_entry("morphogenesis2d").make(config.task, self._device)
         self._trainer = Trainer(task, config, task_name="morphogenesis2d", processes=sharing)
         self._iterate(WARM_UP)
-        self._loss = self._trainer._cycle.iteration.terms[0].item()
+        self._loss = self._trainer._cycle.batch.terms[0].item()
         self._times: list[float] = []
         self._host_times: list[float] = []
         self._reductions: dict[str, float] = {}

@@ -103,7 +103,7 @@ def train(progress: Progress, options: GradientOptions = GradientOptions()) -> R
     cycle = TrainingCycle(task, rules, config, device, schedule, task.rollout)
     # On CUDA there is one graph for each number of steps: capture all before the clock starts.
     for step_count in range(*config.steps) if device.type == "cuda" else (config.steps[0],):
-        cycle.iteration.run(step_count)
+        cycle.batch.run(step_count)
     numbers = itertools.count()
 
     def iteration() -> int:

@@ -147,30 +147,30 @@ class TrainingCycle:
             config, device, run_generator, processes, per_world_streams=per_world_streams
         )
         self.pool = self._make_pool()
-        batch_indices = processes.indices(config.world_count)
-        self._batch_indices = batch_indices.to(device)
-        batch = self.pool.worlds.map(lambda value: value[: len(batch_indices)])
+        self._batch_indices = processes.indices(config.world_count).to(device)
+        first_worlds = self.pool.worlds.map(lambda value: value[: len(self._batch_indices)])
         graphed = device.type == "cuda" and config.cuda_graph
         cls = GraphedIteration if graphed else EagerIteration
-        self.iteration: EagerIteration = cls(
+        self.batch: EagerIteration = cls(
             self.task,
             rule,
             config,
-            batch,
+            first_worlds,
             self.random.masks,
             rollout_particles if rollout is None else rollout,
             take_means=None if processes.count == 1 else processes.reduce,
         )
-        self.optimiser = RuleOptimiser(self.iteration.parameters, config, rule)
-        self.statistics = LossStatistics(self.iteration)
+        self.optimiser = RuleOptimiser(self.batch.parameters, config, rule)
+        self.statistics = LossStatistics(self.batch)
         # Indices in the pool and ages of the batch's worlds, which graphs write.
         self._index, self._age = (torch.zeros_like(self._batch_indices) for _ in range(2))
         self._steps, self._replaced = (torch.zeros_like(self._index[0]) for _ in range(2))
-        self._start_worlds = batch.map(torch.empty_like)
+        self._start_worlds = first_worlds.map(torch.empty_like)
         graph = functools.partial(GraphedCallable, device=device, captured=graphed)
-        self._draw = graph(self._draw_worlds, generator=generator_to_register(self.random.worlds))
-        self._store = graph(self._store_worlds)
-        self._record = graph(self._record_iteration)
+        draws_from = generator_to_register(self.random.worlds)
+        self._graphed_draw = graph(self._draw_worlds, generator=draws_from)
+        self._graphed_store = graph(self._store_worlds)
+        self._graphed_record = graph(self._record_iteration)
 
     def _make_pool(self) -> WorldPool:
         """Return the pool, filled with start worlds."""
@@ -186,21 +186,20 @@ class TrainingCycle:
 
         least_progress: Lower bound on the progress of the learning rate's schedule, in [0, 1].
         """
-        iteration = self.iteration
         lo, hi = self._config.steps
         steps = int(torch.randint(lo, hi, (), generator=self.random.run))
         self.task.begin(number)
-        self._draw()
+        self._graphed_draw()
         restarted = self._restarted_worlds(number)
         if restarted is not None:
-            iteration.start.copy_(self._start_worlds.where(restarted, iteration.start))
-        iteration.run(steps)
+            self.batch.start.copy_(self._start_worlds.where(restarted, self.batch.start))
+        self.batch.run(steps)
         self.statistics.begin(number + 1, steps)
         self._steps.fill_(steps)
-        self._store()
+        self._graphed_store()
         # Not inside a graph: torch watches NCCL only there for processes that do not answer.
-        self._processes.reduce([*iteration.gradients, iteration.terms], self._replaced)
-        self._record()
+        self._processes.reduce([*self.batch.gradients, self.batch.terms], self._replaced)
+        self._graphed_record()
         self.optimiser.step(number, least_progress)
         return steps
 
@@ -245,7 +244,7 @@ class TrainingCycle:
         """Copy worlds from the pool to the batch, some damaged or replaced by start worlds."""
         config, random = self._config, self.random.worlds
         begin_episodes(random, self.random.masks)
-        by_section = config.ages or isinstance(random, WorldRandom)
+        by_section = config.ages or self._per_world_streams
         sample: Any = self.pool.sample_sections if by_section else self.pool.sample
         self._index.copy_(sample(len(self._index), random))
         worlds = self.pool.worlds.take(self._index)
@@ -258,7 +257,7 @@ class TrainingCycle:
         self._start_worlds.copy_(start_worlds)
         if expired is not None:
             worlds = start_worlds.where(expired, worlds)
-        self.iteration.start.copy_(worlds)
+        self.batch.start.copy_(worlds)
 
     def _damaged_and_expired(self, worlds: Particles) -> tuple[Tensor, Tensor | None]:
         """Return which worlds of the batch to damage, and which to replace; set all ages."""
@@ -268,7 +267,7 @@ class TrainingCycle:
             return damaged, None
         age, expired = self.pool.ages_of(self._index)
         self._age.copy_(age.masked_fill(expired, 0))
-        self.iteration.past_min_age.copy_((self._age >= config.stillness_min_age) & ~damaged)
+        self.batch.past_min_age.copy_((self._age >= config.stillness_min_age) & ~damaged)
         if config.damage_and_keep_share > 0.0:
             chance = uniform_draws(self.random.worlds, (len(expired), 1), worlds.x)[:, 0]
             kept = expired & (chance < config.damage_and_keep_share)
@@ -278,7 +277,7 @@ class TrainingCycle:
     @torch.no_grad()
     def _store_worlds(self) -> None:
         age = self._age + self._steps if self._config.ages else None
-        replaced = self.pool.write(self._index, self.iteration.end, self._start_worlds, age)
+        replaced = self.pool.write(self._index, self.batch.end, self._start_worlds, age)
         self._replaced += replaced.sum()
 
     @torch.no_grad()
@@ -286,7 +285,7 @@ class TrainingCycle:
         """Add the iteration's losses to the statistics, and normalise the gradients."""
         self.statistics.add(self._replaced)
         self._replaced.zero_()
-        normalise_gradients(self.iteration.gradients)
+        normalise_gradients(self.batch.gradients)
 
     def _make_start_worlds(self, world_count: int, random: Randomness) -> Particles:
         dtype = self._config.torch_dtype

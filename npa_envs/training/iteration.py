@@ -44,8 +44,7 @@ def _process_mean(take_means: Callable[[Sequence[Tensor]], None], value: Tensor)
 class EagerIteration:
     """One iteration from its start worlds to the gradients, launched kernel by kernel.
 
-    `run` reads the worlds `start`, and writes the worlds `end`, the losses `terms` and the `.grad`
-    of every parameter, always the same tensors: write to `start` with `copy_`. `take_means`
+    `run` always reads and writes the same tensors: write to `start` with `copy_`. `take_means`
     replaces tensors by their means over all processes; None: there is one process.
     """
 
@@ -68,6 +67,7 @@ class EagerIteration:
         self._config = config
         self._divides = bool(fate_parameters(rule))
         self._task = task
+        # Only to learn the names and the dtype of the terms.
         with torch.no_grad():
             total, parts = self._loss(self.start.with_zero_paths())
         self.term_names: tuple[str, ...] = ("loss", *parts)
@@ -83,7 +83,7 @@ class EagerIteration:
         self._rule, self._generator, self._rollout = rule, generator, rollout
 
     def run(self, steps: int) -> None:
-        """Run a rollout of `steps` steps, the loss and the backward pass."""
+        """Run `steps` steps from `start`; write `end`, `terms` and the parameters' `.grad`."""
         # Gradients of codes flow through these states; `start` keeps their values.
         first_states = self._task.with_target_code(self.start.s)
         if first_states is not self.start.s:
@@ -120,9 +120,8 @@ class EagerIteration:
                 # Births and deaths do not count.
                 stayed = (living(s) & living(self.start.s))[..., None]
                 change = torch.where(stayed, change, 0.0)[..., LIFE + 1 :]
-            moved, changed = (
-                power_mean(each, self._config.stillness_power) for each in (path, change)
-            )
+            power = self._config.stillness_power
+            moved, changed = (power_mean(each, power) for each in (path, change))
             change_of_world = moved / self._task.eps + changed
             parts["stillness"] = (self.past_min_age.to(x.dtype) * change_of_world).mean()
             total = total + self._config.stillness_weight * parts["stillness"]

@@ -27,12 +27,12 @@ class LossStatistics:
     graph: it reads and writes the same tensors in each iteration.
     """
 
-    def __init__(self, iteration: EagerIteration) -> None:
-        self._iteration = iteration
-        device = iteration.terms.device
+    def __init__(self, batch: EagerIteration) -> None:
+        self._batch = batch
+        device = batch.terms.device
         # One tensor, so that one copy transfers all of them; float64, in which long sums keep their
         # digits and integers are exact.
-        totals = torch.zeros(len(iteration.terms) + 3, dtype=torch.float64, device=device)
+        totals = torch.zeros(len(batch.terms) + 3, dtype=torch.float64, device=device)
         self._totals = totals
         self._sums, self._replaced, self._bad = totals[:-3], totals[-3], totals[-2:]
         self._bad[0] = NO_ITERATION
@@ -54,7 +54,7 @@ class LossStatistics:
 
     def add(self, replaced: Tensor) -> None:
         """Add an iteration's loss terms and `replaced` worlds, before the optimiser's step."""
-        terms = self._iteration.terms
+        terms = self._batch.terms
         self._sums += terms
         self._replaced += replaced.sum()
         # A comparison with NaN is false: one reduction finds both NaN and infinity.
@@ -86,7 +86,7 @@ class LossStatistics:
         count = max(count, 1)
         means = (self._sent[:-3] / count).tolist()
         replaced, bad_iteration, _ = map(int, self._sent[-3:].tolist())
-        statistics = dict(zip(self._iteration.term_names, means, strict=True))
+        statistics = dict(zip(self._batch.term_names, means, strict=True))
         statistics |= {"steps": step_sum / count, "replaced_worlds": replaced}
         return statistics, bad_iteration == NO_ITERATION
 
@@ -106,7 +106,7 @@ class LossStatistics:
         return {
             "iteration": iteration,
             "steps": steps,
-            "terms": dict(zip(self._iteration.term_names, terms, strict=True)),
+            "terms": dict(zip(self._batch.term_names, terms, strict=True)),
             **values,
         }
 
@@ -122,12 +122,11 @@ class LossStatistics:
         self._step_sum = state["step_sum"]
 
     def _iteration_state(self) -> dict[str, Tensor]:
-        iteration = self._iteration
-        start, end = iteration.start, iteration.end
+        start, end = self._batch.start, self._batch.end
         goals = {} if start.goal is None else {"goal": start.goal}
         worlds = {"x0": start.x, "s0": start.s, "x": end.x, "s": end.s}
-        flat = nn.utils.parameters_to_vector(iteration.parameters).detach()
-        return goals | {"terms": iteration.terms} | worlds | {"parameters": flat}
+        flat = nn.utils.parameters_to_vector(self._batch.parameters).detach()
+        return goals | {"terms": self._batch.terms} | worlds | {"parameters": flat}
 
 
 def divergence_error(

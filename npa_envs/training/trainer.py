@@ -105,10 +105,13 @@ class Trainer:
         self.task, self.config, self.task_name = task, config, task_name
         self.folder = RunFolder(config.out)
         self._log = RunLog(self.folder)
-        self._record: dict[str, Any] = {}
+        self._last_record: dict[str, Any] = {}
         self._unwritten_record: dict[str, Any] | None = None
         """Number and learning rate of the iteration whose log record is not yet written."""
-        self._least_progress, self._seconds_before = 0.0, 0.0
+        self._least_progress = 0.0
+        """`least_progress` of the last `iterate`: the log computes the learning rate with it."""
+        self._seconds_before = 0.0
+        """Time [s] of all `run`s before the present one, also of those before a resumption."""
         self._started: float | None = None
         device = check_device(config.device)
         # On CUDA a record is written an iteration later, so that the device does not idle.
@@ -117,41 +120,42 @@ class Trainer:
         check = functools.partial(check_same_run, task_name=task_name, config=config)
         self._run = Run(self.folder, self._processes, check, resume=resume, overwrite=overwrite)
         checkpoint = self._run.take_content()
-        run_generator = torch.Generator().manual_seed(config.seed)
-        self.rule: NPARule | JointRules = self._make_rule(run_generator, checkpoint, rules)
+        self.rule, self._cycle = self._build(device, checkpoint, rollout, rules)
         """The trained module: one rule, or the rules of all species."""
-        self.rule.to(device, config.torch_dtype)
-        if task.species_counts:
-            counts = task.species_counts
+        self.pool = self._cycle.pool
+        # Up to here files are only read.
+        self._open_folder(checkpoint)
+
+    def _build(
+        self,
+        device: torch.device,
+        checkpoint: dict[str, Any] | None,
+        rollout: Rollout | None,
+        rules: Sequence[NPARule] | None,
+    ) -> tuple[NPARule | JointRules, TrainingCycle]:
+        """Return the module, with initial weights or of a checkpoint's shape, and its cycle."""
+        task, config = self.task, self.config
+        generator = torch.Generator().manual_seed(config.seed)
+        saved = None if checkpoint is None else checkpoint["rule_hyper_parameters"]
+        rule: NPARule | JointRules
+        if counts := task.species_counts:
+            rule = JointRules(_species_rules(config, task.make_rules(generator), saved, rules))
             rollout = functools.partial(species_particles, counts=counts, density_counts=counts)
-        self._cycle = TrainingCycle(
+        else:
+            untrained = task.make_rule(generator)
+            rule = initial_rule(config, untrained) if saved is None else rule_like(saved)
+        return rule, TrainingCycle(
             task,
-            self.rule,
+            rule.to(device, config.torch_dtype),
             config,
             device,
-            run_generator,
+            generator,
             rollout,
             processes=self._processes,
             # A run of several processes keeps these streams when one process resumes it.
             per_world_streams=self._processes.distributed
             or has_per_world_streams(checkpoint or {}),
         )
-        self.pool = self._cycle.pool
-        self._open_folder(checkpoint)
-
-    def _make_rule(
-        self,
-        generator: torch.Generator,
-        checkpoint: dict[str, Any] | None,
-        rules: Sequence[NPARule] | None,
-    ) -> NPARule | JointRules:
-        """Return the module to train: with initial weights, or of the shape of a checkpoint's."""
-        saved = None if checkpoint is None else checkpoint["rule_hyper_parameters"]
-        if self.task.species_counts:
-            each = self.task.make_rules(generator)
-            return JointRules(_species_rules(self.config, each, saved, rules))
-        untrained = self.task.make_rule(generator)
-        return initial_rule(self.config, untrained) if saved is None else rule_like(saved)
 
     def _open_folder(self, checkpoint: dict[str, Any] | None) -> None:
         """Create the folder; then restore the checkpoint of a resumed run, or write a first one."""
@@ -206,8 +210,8 @@ class Trainer:
             if self._due(config.checkpoint_interval) and self.iteration < total:
                 self.save()
             bar.update()
-            if "loss" in self._record:
-                bar.set_postfix(loss=f"{self._record['loss']:.4g}", refresh=False)
+            if "loss" in self._last_record:
+                bar.set_postfix(loss=f"{self._last_record['loss']:.4g}", refresh=False)
 
         with (
             self._run.locked(),
@@ -219,7 +223,7 @@ class Trainer:
             self._started = start
             seconds = math.inf if max_seconds is None else max_seconds
             if first:
-                self._record = next(iter(self._log.records()[-1:]), {})
+                self._last_record = next(iter(self._log.records()[-1:]), {})
             try:
                 interrupted = self._run.repeat(
                     step,
@@ -235,7 +239,7 @@ class Trainer:
             iteration=self.iteration,
             finished=self.iteration >= total,
             interrupted=interrupted,
-            record=self._record,
+            record=self._last_record,
             folder=self.folder.path,
         )
 
@@ -319,21 +323,21 @@ class Trainer:
         statistics, all_finite = self._cycle.statistics.receive()
         if not all_finite:
             self._stop_if_diverged()
-        self._record = {
+        self._last_record = {
             "iteration": begun["iteration"],
             **statistics,
             "learning_rate": begun["learning_rate"],
             "seconds": round(self._seconds(), 3),
         }
         if self._processes.first:
-            self._log.append(self._record)
+            self._log.append(self._last_record)
 
     def _write_picture(self) -> None:
         self._write_record()
         if not self._processes.first:
             return
         with torch.no_grad():
-            end = self._cycle.iteration.end
+            end = self._cycle.batch.end
             picture = self._cycle.task.picture(end.x, end.s)
         # Worlds with different goals have no common target picture.
         target = getattr(self.task, "target_picture", None) if end.goal is None else None

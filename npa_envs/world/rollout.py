@@ -318,7 +318,7 @@ def run_rules(
         generator,
         cuda_graph=cuda_graph,
         watch=make_watch(on_divergence, worlds),
-        return_path_length=return_path_length,
+        with_paths=return_path_length,
     )
     path_length = after.path_length if return_path_length else None
     return after.with_fields(path_length=path_length, goal=worlds.goal)

@@ -62,16 +62,15 @@ def execute(
     rules: Sequence[NPARule],
     particles: Particles,
     generator: Randomness | None,
-    *,
     cuda_graph: CudaGraph,
     watch: DivergenceWatch | None,
-    return_path_length: bool,
+    with_paths: bool,
 ) -> Particles:
     """Run a checked rollout, and return what `run_all_steps` does.
 
     Without a watch and path lengths it skips the steps after all worlds have come to rest.
     """
-    if watch is not None or return_path_length or not _can_rest(spec, rules, particles.x):
+    if watch is not None or with_paths or not _can_rest(spec, rules, particles.x):
         return run_all_steps(spec, rules, particles, generator, cuda_graph, watch)
     remaining, steps = spec.steps, FIRST_PART[particles.x.device.type]
     while remaining and not resting(rules, particles, spec.physics, cuda_graph).all():

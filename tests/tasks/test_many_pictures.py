@@ -123,7 +123,7 @@ def test_training_changes_codes_and_keeps_them_with_their_worlds(encoder, monkey
     assert len(calls) == 3 * encoder
     moved = (rule.codes.table.detach() - before).abs().sum(dim=1)
     assert int((moved > 0.0).sum()) >= (3 if encoder else 1)
-    goal, x0, s0 = cycle.iteration.start.goal, cycle.iteration.start.s, cycle.iteration.end.s
+    goal, x0, s0 = cycle.batch.start.goal, cycle.batch.start.s, cycle.batch.end.s
     assert torch.equal(x0[..., :3], s0[..., :3])
     assert x0[..., :3].unique(dim=1).shape[1] == 1
     assert goal.shape == (2,)

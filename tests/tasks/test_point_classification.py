@@ -142,7 +142,7 @@ def test_classes_stay_with_their_worlds(
     for iteration in range(5):
         cycle.run(iteration)
         assert_goals_fit(cycle.pool.worlds.x, cycle.pool.worlds.goal, cycle.task.clouds)
-        assert torch.equal(cycle.iteration.end.x, cycle.iteration.start.x)
+        assert torch.equal(cycle.batch.end.x, cycle.batch.start.x)
     assert not torch.equal(cycle.pool.worlds.x, before)
 
 
@@ -151,7 +151,7 @@ def test_so_many_worlds_of_a_batch_are_fresh_clouds(folder, tmp_path, fraction, 
     cycle, _ = cycle_of(folder, tmp_path, fresh_share=fraction, world_count=6, damage_share=0.0)
     cycle.pool.worlds.s.add_(0.5)
     cycle.run(0)
-    blank = (cycle.iteration.start.s == 0.0).flatten(1).all(1)
+    blank = (cycle.batch.start.s == 0.0).flatten(1).all(1)
     assert blank.tolist() == [True] * count + [False] * (6 - count)
 
 

@@ -72,19 +72,18 @@ def clouds_cycle(tmp_path, per_world_streams=False, **fields):
 )
 def test_replayed_operations_train_the_same_rule_as_called_ones(tmp_path, make, fields):
     (called, called_rule), (replayed, replayed_rule) = (make(tmp_path, **fields) for _ in range(2))
-    replayed._draw, replayed._store = Recording(replayed._draw), Recording(replayed._store)
-    replayed._record = Recording(replayed._record)
+    names = "_graphed_draw", "_graphed_store", "_graphed_record"
+    for name in names:
+        setattr(replayed, name, Recording(getattr(replayed, name)))
     for iteration in range(8):
         for cycle in (called, replayed):
             cycle.run(iteration)
             cycle.statistics.send()
         assert replayed.statistics.receive() == called.statistics.receive()
-        assert_same(replayed.iteration.start, called.iteration.start)
+        assert_same(replayed.batch.start, called.batch.start)
         assert_same(replayed_rule.state_dict(), called_rule.state_dict())
     assert_same(replayed.state_dict(), called.state_dict())
-    assert len(replayed._draw.recorded) > 5
-    assert len(replayed._store.recorded) > 5
-    assert len(replayed._record.recorded) > 5
+    assert all(len(getattr(replayed, name).recorded) > 5 for name in names)
 
 
 @pytest.mark.gpu

@@ -212,7 +212,7 @@ def test_worlds_that_are_old_and_never_damaged_are_past_the_minimum_age(tmp_path
     seen = []
 
     def rollout(rule, worlds, steps, **options):
-        seen.append(trainer._cycle.iteration.past_min_age.tolist())
+        seen.append(trainer._cycle.batch.past_min_age.tolist())
         return plain_rollout(rule, worlds, 2, **options)
 
     fields = {"iterations": 6, "world_count": 4, "pool_size": 4, "max_age_range": (200, 6000)}
