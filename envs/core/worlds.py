@@ -91,7 +91,7 @@ class BatchedWorlds(WorldState):
         rules = EpisodeRules(self.episode_steps, rewarded_step, config.on_divergence)
         self.episodes = WorldEpisodes(rules, self.enabled, self.diverged)
         kind = REWARDS[config.reward].particle_rewards
-        self.particle_rewards: ParticleRewards | None = kind and kind(self.particles)
+        self.particle_rewards: ParticleRewards | None = kind(self.particles) if kind else None
         """Rewards of single particles, where they have any."""
 
     @torch.no_grad()
