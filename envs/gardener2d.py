@@ -69,8 +69,7 @@ class GardenerTask(GardenTask[Gardener2DEnvConfig]):
         x = push(x, centre=centre, move=move, radius=config.gust_radius, box=box)
         # A negative radius wipes nothing.
         centre = random_particle(x, random)
-        happens = chance[:, 1] < config.blight_chance
-        radius = torch.where(happens, config.blight_radius, -1.0)
+        radius = torch.where(chance[:, 1] < config.blight_chance, config.blight_radius, -1.0)
         s = wipe_state(x, s, centre=centre, radius=radius, box=box)
         return particles._replace(x=x, s=s)
 

@@ -89,8 +89,7 @@ class GardenersEnv(KnownAgents):
         calm = {"gust_chance": 0.0, "blight_chance": 0.0}
         self.garden = _SharedGarden(**(calm | config | {"episode_steps": self.max_cycles}))
         """The world as a Gymnasium environment, whose actions are dicts with both agents'."""
-        self.render_mode = self.garden.render_mode
-        self.possible_agents = list(AGENTS)
+        self.render_mode, self.possible_agents = self.garden.render_mode, list(AGENTS)
         self.agents: list[str] = []
         self.observation_spaces = dict.fromkeys(AGENTS, self.garden.observation_space)
         self.action_spaces = dict.fromkeys(AGENTS, self.garden.action_space)

@@ -21,7 +21,7 @@ from npa_envs.envs.core.single import NPAEnv
 from npa_envs.envs.core.task import Start
 from npa_envs.envs.core.vector import vector_class
 from npa_envs.envs.garden.base import coarse
-from npa_envs.envs.garden.brush_actions import OBSERVATION_LIMIT, GardenReward
+from npa_envs.envs.garden.brush_actions import GARDEN_REWARDS, OBSERVATION_LIMIT
 from npa_envs.envs.morphogenesis2d import PictureConfig
 from npa_envs.envs.trained_rules import (
     OF_PARTICLES,
@@ -52,12 +52,9 @@ class Shapeshifter2DEnvConfig(PictureConfig):
     """`PictureConfig` with the rule of many pictures, and how goals change."""
 
     fixed = PictureConfig.fixed | OF_PARTICLES
-    choices = EnvConfig.choices | {
-        "reward": get_args(GardenReward),
-        "actions": get_args(CodeActions),
-    }
+    choices = EnvConfig.choices | {"reward": GARDEN_REWARDS, "actions": get_args(CodeActions)}
 
-    reward: GardenReward = "dense"
+    reward: str = "dense"
     """"dense": the closeness to the goal in each step; "sparse": that of the last step only."""
 
     particle_count: int = 256
@@ -178,8 +175,7 @@ class ShapeshifterTask(RuleDrivenTask[Shapeshifter2DEnvConfig]):
         # Without particles in the picture colours do not count, and nothing is centred.
         goal_task = self.task.with_goal(goals)
         difference = goal_task.picture(x, s, centred=False) - goal_task.target_picture
-        error = difference[..., 3].square() + difference[..., 3].abs()
-        return error.flatten(1).mean(dim=1)
+        return (difference[..., 3].square() + difference[..., 3].abs()).flatten(1).mean(dim=1)
 
     def fresh(self, random: WorldRandom) -> Start:
         """Return grown worlds of random pictures, with other pictures as their goals."""
@@ -191,8 +187,7 @@ class ShapeshifterTask(RuleDrivenTask[Shapeshifter2DEnvConfig]):
 
     def _another(self, goal: Tensor, random: WorldRandom) -> Tensor:
         """Return random goals, each other than `goal`, int64, shape [B]."""
-        count = len(self.codes)
-        return (goal + 1 + random.integers(count - 1, 1)[:, 0]) % count
+        return (goal + 1 + random.integers(len(self.codes) - 1, 1)[:, 0]) % len(self.codes)
 
     def episode_context(self, start: Start, loss: Tensor, random: WorldRandom) -> PictureGoals:
         """Return the first goal of each episode, and all its random goals in order."""
@@ -214,8 +209,7 @@ class ShapeshifterTask(RuleDrivenTask[Shapeshifter2DEnvConfig]):
 
     def reward(self, particles: Particles, loss: Tensor, context: PictureGoals) -> Tensor:
         """Return rewards, [B]: 1 for a loss of 0, 0 for the loss without particles."""
-        empty = self.empty_losses.index_select(0, context.goal)
-        return (1.0 - loss / empty).clamp_min(-1.0)
+        return (1.0 - loss / self.empty_losses.index_select(0, context.goal)).clamp_min(-1.0)
 
     def next_goals(self, elapsed: Tensor, context: PictureGoals, goal: Tensor) -> None:
         """Write each world's goal into `goal`, [B]; it changes every `hold_steps` steps."""

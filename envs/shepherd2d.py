@@ -17,12 +17,7 @@ from npa_envs.envs.core.base import to_output
 from npa_envs.envs.core.task import Start
 from npa_envs.envs.core.vector import vector_class
 from npa_envs.envs.garden.base import GardenEnv, GardenTask, moments_of
-from npa_envs.envs.garden.brush_actions import (
-    OBSERVATION_LIMIT,
-    BrushSpaces,
-    GardenConfig,
-    GardenReward,
-)
+from npa_envs.envs.garden.brush_actions import OBSERVATION_LIMIT, BrushSpaces, GardenConfig
 from npa_envs.tasks.seeds import uniform_ball
 from npa_envs.world.environment_steps import Physics
 from npa_envs.world.particles import Particles
@@ -37,7 +32,7 @@ class Shepherd2DEnvConfig(GardenConfig):
 
     choices = GardenConfig.choices | {"aim": get_args(Aim)}
 
-    reward: GardenReward = "dense"
+    reward: str = "dense"
     """"dense": minus the distance to the goal; "sparse": 0 at the goal and -1 elsewhere."""
 
     place_count: int = 2
@@ -223,9 +218,8 @@ class _GoalReward:
     ) -> NDArray[np.float64] | Any:
         """Return the rewards, [...], for any achieved and desired goals, [..., 3] each."""
         # By torch, as in steps: NumPy's square roots round differently on some processors.
-        achieved = torch.tensor(np.asarray(achieved_goal))
-        desired = torch.tensor(np.asarray(desired_goal))
-        rewards: NDArray[Any] = self.task.goal_reward(achieved, desired).numpy()
+        goals = (torch.tensor(np.asarray(goal)) for goal in (achieved_goal, desired_goal))
+        rewards: NDArray[Any] = self.task.goal_reward(*goals).numpy()
         return rewards
 
 

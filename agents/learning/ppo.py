@@ -30,11 +30,7 @@ from npa_envs.agents.learning.actor_critic import (
     set_gradients,
     worlds_of_process,
 )
-from npa_envs.agents.learning.problem import (
-    WORLDS_PER_SEED,
-    Problem,
-    world_seeds,
-)
+from npa_envs.agents.learning.problem import WORLDS_PER_SEED, Problem, world_seeds
 from npa_envs.agents.learning.progress import Progress
 from npa_envs.agents.learning.rule_set import RuleSet
 from npa_envs.checks import check_flag, check_positive, check_word

@@ -300,8 +300,7 @@ class EnvConfig(WorldConfig):
     continues with values clipped to the limits. `info["diverged"]` is True in each case."""
 
     reward: str = "dense"
-    """What is rewarded, and when: "dense", "sparse", "particle" or "marginal", as in the section
-    Reward."""
+    """What is rewarded, and when: a word of the table in the section Reward."""
 
     tell_updated: bool = False
     """Report in `info["updated"]` which particles the step updated. The others ignored their

@@ -48,10 +48,9 @@ class GraphedSteps:
         to_host: bool,
     ) -> None:
         self._particles, self._physics, self._actions = particles, physics, actions
-        self._side_stream = side_stream
-        self._evaluate, self._to_host = WeakFunction(evaluate), to_host
-        x = particles.x
-        device = x.device
+        self._to_host, self._side_stream = to_host, side_stream
+        self._evaluate = WeakFunction(evaluate)
+        x, device = particles.x, particles.x.device
         self._is_one_graph = x.is_cuda and x.shape[:2].numel() <= MAX_GRAPHED_PARTICLES
         self._draw = GraphedCallable(actions.draw, device)
         self._evaluate_graph = GraphedCallable(self._evaluate_and_sort, device)

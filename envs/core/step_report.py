@@ -280,8 +280,7 @@ class RewardKind(NamedTuple):
     """What a value of `reward=` rewards, and when."""
 
     last_step_only: bool
-    """Whether worlds are rewarded in the last step of an episode alone, with minus their loss; else
-    in each step, with the decrease of it."""
+    """True: minus the loss, in the last step of an episode; False: its decrease, in each step."""
     particle_rewards: type[ParticleRewards] | None
     """What computes rewards of single particles; None: only worlds are rewarded."""
 
@@ -293,6 +292,5 @@ REWARDS = {
     "marginal": RewardKind(last_step_only=False, particle_rewards=MarginalGains),
 }
 """Values of `reward=` in environments of one species; the docstring of `NPAEnv` explains each."""
-
 PARTICLE_REWARDS = tuple(word for word, kind in REWARDS.items() if kind.particle_rewards)
 """Values of `reward=` that reward single particles."""

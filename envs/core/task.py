@@ -69,8 +69,7 @@ class WorldTask(Generic[AnyConfig]):
     """Whether particles never move; actions then only change states."""
 
     def __init__(self, config: AnyConfig, device: torch.device) -> None:
-        self.config = config
-        self.device = device
+        self.config, self.device = config, device
 
     @property
     def pixel_size(self) -> float:

@@ -18,7 +18,7 @@ from torch import Tensor
 from npa_envs.checks import check_count, number_tensor
 from npa_envs.envs.core.base import WorldsEnv
 from npa_envs.envs.core.config import as_python
-from npa_envs.envs.core.step_report import StepReport, reason
+from npa_envs.envs.core.step_report import TRUE_ROW, StepReport, reason
 from npa_envs.errors import NPAError, shown, suggest
 from npa_envs.world.cuda_graph import to_device_async
 from npa_envs.world.environment_steps import TIME_LIMIT
@@ -207,7 +207,7 @@ class NPAVectorEnv(WorldsEnv, BatchedSpaces):
         rows = self._report_rows(report)
         terminated, truncated, success, diverged, all_worlds, *_ = unbound(self._out(report.flags))
         if not copy:
-            all_worlds = self._out(report.flags[4].clone())
+            all_worlds = self._out(report.flags[TRUE_ROW].clone())
         which = all_worlds if stepped is None else self._mask(stepped)
         of_all = self.losses_of(rows) | self._returned_values(worlds.extra_info(), copy=copy)
         of_step = self._improvements(rows) | {"success": success, "diverged": diverged}

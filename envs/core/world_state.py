@@ -50,8 +50,7 @@ def free_bytes(device: torch.device) -> int | None:
     """Return the free memory of a device [bytes], or None if it is unknown."""
     if device.type == "cuda":
         free, _ = torch.cuda.mem_get_info(device)
-        cached = torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
-        return int(free) + cached
+        return int(free) + torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
     try:
         for line in Path("/proc/meminfo").read_text(encoding="utf-8").splitlines():
             if line.startswith("MemAvailable:"):
@@ -104,8 +103,7 @@ class WorldState:
     ) -> None:
         check_default_dtype()
         self.device = device = check_device(config.device)
-        self.world_count = world_count
-        self.particle_count = particle_count
+        self.world_count, self.particle_count = world_count, particle_count
         self.physics = physics = config.physics(task_type.space_dim, static=task_type.static)
         """Constants of perception and motion."""
         check_memory(world_count, particle_count, physics, device, extra_bytes)

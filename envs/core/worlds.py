@@ -91,7 +91,7 @@ class BatchedWorlds(WorldState):
         rules = EpisodeRules(self.episode_steps, rewarded_step, config.on_divergence)
         self.episodes = WorldEpisodes(rules, self.enabled, self.diverged)
         kind = REWARDS[config.reward].particle_rewards
-        self.particle_rewards: ParticleRewards | None = kind and kind(self.particles)
+        self.particle_rewards: ParticleRewards | None = kind(self.particles) if kind else None
         """Rewards of single particles, where they have any."""
 
     @torch.no_grad()
@@ -103,21 +103,18 @@ class BatchedWorlds(WorldState):
         if not self.episodes.term_names:
             return self._first_start(world_indices, random)
         # On CUDA a start may be captured as a graph, so that checks must not synchronise.
-        return self._begun(world_indices, random, self._made(random), check=not self.x.is_cuda)
+        start = self.task.start(random)
+        return self._begun(world_indices, random, start, check=not self.x.is_cuda)
 
     def _first_start(self, world_indices: Tensor, random: WorldRandom) -> Start:
         """Start the first episodes, and check that the task draws from no global generator."""
         with no_global_draws(self.task, start_method(self.task)):
-            start = self._made(random)
+            start = self.task.start(random)
         with no_global_draws(self.task, "losses"):
             return self._begun(world_indices, random, start, check=True)
 
-    def _made(self, random: WorldRandom) -> Start:
-        start = self.task.start(random)
-        check_start(self.task, start, random.world_count, (self.x.shape, self.s.shape))
-        return start
-
     def _begun(self, indices: Tensor, random: WorldRandom, start: Start, *, check: bool) -> Start:
+        check_start(self.task, start, len(indices), (self.x.shape, self.s.shape))
         if check:
             name = start_method(self.task)
             check_finite(self.task, name, {"positions": start.x, "states": start.s})
@@ -336,8 +333,7 @@ class ParticleWorlds(BatchedWorlds):
         elif self.x.is_cuda and self.task.start_is_short:
             self._graphed_starts(world_indices, observation)
         else:
-            index = to_device_async(world_indices, self.device)
-            self._start_and_sort(index).perceive(observation)
+            self._start_and_sort(to_device_async(world_indices, self.device)).perceive(observation)
 
     def _start_and_sort(self, world_indices: Tensor) -> NeighbourState:
         start = self.start(world_indices)

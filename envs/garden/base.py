@@ -74,8 +74,7 @@ class TargetDeficit:
 
 def coarse(pictures: Tensor, size: int) -> Tensor:
     """Return pictures, [B, R, R, channels], as coarse observations, [B, channels size²]."""
-    pixels = pictures.shape[1] // size
-    observed = F.avg_pool2d(pictures.permute(0, 3, 1, 2), pixels).flatten(1)
+    observed = F.avg_pool2d(pictures.permute(0, 3, 1, 2), pictures.shape[1] // size).flatten(1)
     return observed.clamp(-OBSERVATION_LIMIT, OBSERVATION_LIMIT)
 
 
@@ -112,8 +111,7 @@ class GardenTask(RuleDrivenTask[Config], GrownTask[Config]):
         self, x: Tensor, s: Tensor, action: Tensor, random: WorldRandom
     ) -> tuple[Tensor, Tensor]:
         """Return x and s after brushes, steps of the rule and `disturb`; differentiable."""
-        rolled = self.brush_and_roll(Particles(x, s), action, random)
-        x, s, *_ = self.disturb(rolled, random)
+        x, s, *_ = self.disturb(self.brush_and_roll(Particles(x, s), action, random), random)
         return x, s
 
     def brush_and_roll(
@@ -122,8 +120,7 @@ class GardenTask(RuleDrivenTask[Config], GrownTask[Config]):
         """Return worlds after the brushes and the rule's steps, before `disturb`."""
         config = self.config
         run = partial(run_rule, self.rule, config, random=random, detach_positions=False)
-        middle = self.middle(particles.x)
-        particles, rate = apply_brushes(particles, action, middle, config)
+        particles, rate = apply_brushes(particles, action, self.middle(particles.x), config)
         if rate is None:
             return run(particles, config.rule_steps)
         box = self.periodic_sides
@@ -140,8 +137,7 @@ class GardenTask(RuleDrivenTask[Config], GrownTask[Config]):
 
     def episode_context(self, start: Start, loss: Tensor, random: WorldRandom) -> Any:
         """Return the losses of the grown pictures, and how much they rise if these are grey."""
-        zeros = torch.zeros_like(start.s)
-        grey = sum(self.losses(start.x, zeros).values(), torch.zeros_like(loss))
+        grey = sum(self.losses(start.x, torch.zeros_like(start.s)).values(), torch.zeros_like(loss))
         # The loss of a picture that did not grow may not rise at all.
         return StartLosses(loss, (grey - loss).maximum(MIN_GREY_RISE * loss))
 

@@ -28,7 +28,7 @@ VALUES_PER_PLACE = 6
 
 BrushActions = Literal["grid", "free", "discrete"]
 Observe = Literal["grid", "picture", "moments"]
-GardenReward = Literal["dense", "sparse"]
+GARDEN_REWARDS = "dense", "sparse"
 
 BRUSH_TOOLS = ("push", "wipe", "inject", "rate")
 """Effects that a brush of an agent can have."""
@@ -40,12 +40,12 @@ class GardenConfig(GrownConfig):
 
     fixed = GrownConfig.fixed | OF_PARTICLES
     choices = GrownConfig.choices | {
-        "reward": get_args(GardenReward),
+        "reward": GARDEN_REWARDS,
         "actions": get_args(BrushActions),
         "observe": get_args(Observe),
     }
 
-    reward: GardenReward = "dense"
+    reward: str = "dense"
     """"dense": the world's score in each step; "sparse": its score in the last step only."""
 
     target: str = "heart"
@@ -224,8 +224,7 @@ class BrushSpaces(ParticleSpaces):
     """Spaces with one observation of a whole world and with actions of brushes."""
 
     def __init__(self, physics: Physics, config: GardenConfig) -> None:
-        self._config = config
-        self._output = config.output
+        self._config, self._output = config, config.output
         counts = {
             "grid": VALUES_PER_PLACE * config.place_count**2,
             "picture": (8 if config.observe_error else 4) * config.picture_size**2,
@@ -233,8 +232,7 @@ class BrushSpaces(ParticleSpaces):
         }
         limit, shape = OBSERVATION_LIMIT, (counts[config.observe],)
         self.observation_space: Space[Any] = Box(-limit, limit, shape, np.float32)
-        on_grid = config.actions == "grid"
-        count = config.place_count**2 if on_grid else config.brush_count
+        count = config.place_count**2 if config.actions == "grid" else config.brush_count
         self.rows_shape = (count, BrushLayout.for_config(config).width)
         """Shape (J, W) of a world's rows of brushes."""
         self._tools = tool_table(config)

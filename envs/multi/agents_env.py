@@ -29,10 +29,8 @@ class AgentsEnv(ShownEnv):
         self, task: str, keywords: dict[str, Any], world_count: int, *, by_particle: bool
     ) -> None:
         self.worlds = worlds = SpeciesWorlds(task, keywords, world_count, by_particle=by_particle)
-        self._task_name = task
-        self.config = worlds.config
-        self.render_mode = self.config.render_mode
-        self.max_cycles = self.config.max_cycles
+        self._task_name, self.config = task, worlds.config
+        self.render_mode, self.max_cycles = worlds.config.render_mode, worlds.config.max_cycles
         """Steps after which an episode is truncated for all agents."""
         played = self.config.agent_particle_counts
         word, count = ("particle", sum(played)) if by_particle else ("species", len(played))

@@ -66,13 +66,10 @@ class AgentReturns:
     """Losses of all agents in B worlds, and their rewards: the decrease of the losses in a step."""
 
     def __init__(self, task: SpeciesTask, species: Tensor, world_count: int, *, team: bool) -> None:
-        self._task = task
-        self._species = species
-        self._team = team
+        self._task, self._species, self._team = task, species, team
         self.term_names: tuple[str, ...] = ()
         """Names of the terms of the loss; empty before the first episode."""
-        shape = world_count, len(species)
-        zeros = torch.zeros(shape, dtype=torch.float64, device=species.device)
+        zeros = species.new_zeros(world_count, len(species), dtype=torch.float64)
         self.loss = zeros
         """Every agent's loss, float64, shape [B, M]."""
         self._terms = self._terms_before = zeros[None]
@@ -298,8 +295,7 @@ class SpeciesWorlds(WorldState):
         """Return [position; state; 1] of each particle, zeros if removed, [B, N, 2 + C + 1]."""
         self._copy_from_groups()
         present = to_device_async(self.present[:, self.owner], self.device)[..., None]
-        rows = torch.cat((self.x, self.s, present.float()), dim=-1)
-        return torch.where(present, rows, 0.0)
+        return torch.where(present, torch.cat((self.x, self.s, present.float()), dim=-1), 0.0)
 
     def pictures(self, count: int) -> NDArray[np.uint8]:
         """Return pictures of the first worlds, uint8, shape [count, R, R, 3]."""
@@ -355,10 +351,8 @@ class SpeciesWorlds(WorldState):
     def groups(self) -> list[WorldGroup]:
         """The worlds whose episodes continue, grouped by their remaining particles."""
         if self._groups is None:
-            if self.running.all() and self.present.all():
-                self._groups = [self._all_worlds]
-            else:
-                self._groups = self._grouped()
+            is_whole = self.running.all() and self.present.all()
+            self._groups = [self._all_worlds] if is_whole else self._grouped()
         return self._groups
 
     @makes_plain_tensors
@@ -421,9 +415,8 @@ class WorldGroup:
         self._neighbours: NeighbourState | None = None
         enabled = torch.ones(1, dtype=torch.uint8, device=device)
         diverged = torch.zeros(len(worlds), dtype=torch.uint8, device=device)
-        x, s, *_ = particles
         flags = {"enabled": enabled, "diverged": diverged}
-        self._actions = Actions(x, s, batch.physics, random, **flags)
+        self._actions = Actions(particles.x, particles.s, batch.physics, random, **flags)
         self._draw = GraphedCallable(self._actions.draw, device)
         self._evaluate_graph = GraphedCallable(self._evaluate, device)
 

@@ -177,6 +177,5 @@ class MultiSpeciesVectorEnv(AgentsEnv):
 
     def _columns(self, values: Any) -> ByAgent:
         """Return each agent's column, [B], of `values`, [B, M]."""
-        rows = values.T.contiguous() if isinstance(values, Tensor) else values.T.copy()
-        columns = self._out(rows)
-        return {agent: columns[k] for k, agent in enumerate(self.possible_agents)}
+        rows = self._out(values.T.contiguous() if isinstance(values, Tensor) else values.T.copy())
+        return {agent: rows[k] for k, agent in enumerate(self.possible_agents)}

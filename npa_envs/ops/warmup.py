@@ -81,7 +81,7 @@ def _warm_rewards(elapsed: torch.Tensor) -> None:
         elapsed=elapsed.clone(),
         numbers=number.new_zeros(4, 1),
         flags=flag.new_zeros(4, 1, dtype=torch.bool),
-        endings=flag.new_zeros(2),
+        ending_bits=flag.new_zeros(2),
     )
     update_episodes(number[None])
 
