@@ -95,7 +95,7 @@ class Progress:
     the curve, and when SIGTERM or Ctrl-C stops the run. A resumed run continues from the weights,
     optimisers and counts of the checkpoint, on any number of processes, with new episodes.
 
-    In torch's process group all use the clock of rank 0 and evaluate the same episodes; rank 0 writes.
+    Processes use the clock of rank 0 and evaluate the same episodes; rank 0 reports and writes.
 
     Args:
         initial: Rules to begin with, which are copied; None: new ones.
