@@ -23,13 +23,16 @@ class Particles(NamedTuple):
 
     def with_zero_paths(self, zeros: Tensor | None = None) -> Particles:
         """Return the worlds with path lengths of 0: the tensor `zeros` [B, N], or a new one."""
-        if zeros is None:
-            zeros = self.x.new_zeros(self.x.shape[:2])
+        zeros = self.x.new_zeros(self.x.shape[:2]) if zeros is None else zeros
         return self.with_fields(path_length=zeros)
 
     def with_fields(self, **values: Tensor | None) -> Particles:
         """Return the worlds with other values of some fields; unlike `_replace` it compiles."""
         return Particles(*(values.get(name, getattr(self, name)) for name in self._fields))
+
+    def moved(self, x: Tensor, s: Tensor, path_length: Tensor) -> Particles:
+        """Return the worlds with other positions, states and path lengths."""
+        return self.with_fields(x=x, s=s, path_length=path_length)
 
     def per_particle(self) -> tuple[Tensor, Tensor, Any]:
         """Return x, s and the path lengths, in the order that `update_particles` takes."""

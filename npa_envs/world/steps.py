@@ -159,10 +159,9 @@ def _updated(
     particles: Particles, update: Tensor, active: Rows, draws: Draws, physics: Physics
 ) -> Particles:
     """Return the worlds after updates [K, A] of active particles, and position noise of all."""
-    if draws.noise is not None:
-        particles = particles._replace(x=particles.x + draws.noise)
-    fields = update_particles(update, *particles.per_particle(), active, physics)
-    return Particles(*fields, particles.goal)
+    x, s, paths, *_ = particles.per_particle()
+    x = x if draws.noise is None else x + draws.noise
+    return particles.moved(*update_particles(update, x, s, paths, active, physics))
 
 
 @dataclasses.dataclass
