@@ -86,9 +86,9 @@ class ScriptedGardener(BrushPolicy):
     Brushes on a grid all push. Each free brush goes to the free place that needs the longest push.
 
     Args:
-        gain: Factor on the deficit's gradient, which a brush pushes along (dimensionless).
-        share: Factor on a brush's pushes towards all places, by their deficits (dimensionless).
-        width: Standard deviation of the Gaussian weight of other places [length units].
+        gain: Factor on a push's first part, along the deficit's gradient (dimensionless).
+        share: Factor on its other part, to all places by deficit and nearness [1 / length units].
+        width: Standard deviation of nearness, a Gaussian of distance [length units].
     """
 
     def __init__(self, env: Any, gain: float = 0.5, share: float = 0.6, width: float = 0.4) -> None:

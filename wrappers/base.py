@@ -62,7 +62,7 @@ def vector_env(env: Any, wrapper: str) -> NPAVectorEnv:
 
 
 def torch_env(env: Any, adapter: str) -> NPAVectorEnv:
-    """Return the vector environment under wrappers, checked to give new tensors in each step."""
+    """Unwrap a vector environment whose steps return new torch tensors; errors name `adapter`."""
     base = vector_env(env, adapter)
     if base.config.output != "torch":
         raise NPAError(

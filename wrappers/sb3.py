@@ -460,7 +460,7 @@ class SpeciesVecEnv(RowVecEnv):
         return torch.cat((rows, self._tags.to(rows.device).expand(len(rows), -1, -1)), dim=2)
 
     def _repeated(self, by_species: Mapping[str, Any]) -> Tensor:
-        """Repeat each species' values [B] for all of its rows, shape [B, R]."""
+        """Repeat each species' values, [B], for its particles: R in each of B worlds, [B, R]."""
         values = [as_tensor(by_species[name]) for name in self.rows_of]
         return torch.cat(
             [value[:, None].expand(-1, n) for value, n in zip(values, self._counts, strict=True)],

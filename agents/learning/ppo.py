@@ -537,7 +537,7 @@ def _copy_each(sources: Sequence[Tensor], targets: Sequence[Tensor]) -> None:
 
 
 class GraphedFunctions:
-    """Methods of a `PPOLearner` of the same names, as graphs with their inputs and outputs."""
+    """A `PPOLearner`'s methods, by name: `GraphedFunction`s (CUDA graphs) with fixed tensors."""
 
     def __init__(self, learner: PPOLearner) -> None:
         buffers, count = learner.buffers, learner.minibatches.count

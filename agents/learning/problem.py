@@ -143,7 +143,7 @@ class Problem:
 
     @property
     def interface(self) -> Interface:
-        """Columns of observations and actions."""
+        """Meaning of the columns of its environments' observations and actions."""
         return self.config.interface(self.physics)
 
     @property

@@ -326,7 +326,7 @@ class TargetEnvTask(EnvTask[Config]):
         return Start(worlds.x, s, goal=worlds.goal)
 
     def with_goal(self, goal: Tensor) -> Self:
-        """Return the task with losses for worlds of these goals, int64 [B]."""
+        """Return a copy whose losses compare world b with target `goal[b]`, an index, int64 [B]."""
         goal_task = copy.copy(self)
         goal_task.task = self.task.with_goal(goal)
         return goal_task

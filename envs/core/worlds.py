@@ -310,7 +310,7 @@ class ParticleWorlds(BatchedWorlds):
         return self._observed(NeighbourState(self.x, self.s, self.physics), out)
 
     def _observed(self, perceived: NeighbourState | GraphedSteps, out: Tensor | None) -> Tensor:
-        """Return all worlds' observations, with target columns, in `out` if it is given."""
+        """Return perceptions and any columns of the targets, [B, N, P], in `out` if it is given."""
         if self.task.target_rows is None:
             return perceived.perceive(out)
         rows = self._with_target(perceived.perceive(), self.goal)

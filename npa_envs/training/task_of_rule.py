@@ -23,7 +23,7 @@ from npa_envs.training.task_table import override, preset, task_entry
 
 @dataclass(frozen=True)
 class TrainedTask:
-    """The task of a rule, and whether its target is known."""
+    """The task that a rule was trained on, and whether a built-in target replaces its own."""
 
     task: Task
     why_not_measurable: str | None

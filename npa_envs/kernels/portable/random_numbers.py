@@ -148,7 +148,7 @@ def draw_kernel(distribution: str, value_type: type) -> tuple[wp.Kernel, int]:
         # outputs
         values: wp.array2d[value_type],
     ):
-        """Write each world's random numbers of the draw with this `number`."""
+        """Write the worlds' random numbers: draw `number` of a step; `bound`: see `draw_kernel`."""
         world, block = wp.tid()
         drawn = numbers_of(world_words(world, block, number, keys, episodes, steps), bound)
         for k in range(wp.static(count)):

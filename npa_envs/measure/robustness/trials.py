@@ -326,7 +326,7 @@ def wipe(x: Tensor, s: Tensor, random: WorldRandom, box: Box) -> tuple[Tensor, T
 
 
 def slit(x: Tensor, s: Tensor, random: WorldRandom, box: Box) -> tuple[Tensor, Tensor]:
-    """Return x and s cut at a random angle, through the centroid or in a box a random particle."""
+    """Return x cut at a random angle through the centroid (a random particle if periodic) and s."""
     centre = world_mean(x) if box is None else random_particle(x, random)
     normal = random.normal(x.shape[2], dtype=x.dtype)
     change = partial(cut, normal=normal, gap=DAMAGE_SIZES["cut"])

@@ -91,7 +91,7 @@ def open_image(path: Path) -> Image.Image:
 
 @contextlib.contextmanager
 def no_foreign_programs() -> Iterator[None]:
-    """Return a context in which Pillow starts no other programs for libraries that use it."""
+    """Return a context in which Pillow runs no Ghostscript, whichever library calls Pillow."""
     before = EpsImagePlugin.gs_binary
     EpsImagePlugin.gs_binary = False
     try:
