@@ -160,18 +160,18 @@ def _in_form_of(observed: Any, action: Tensor) -> Any:
 
 
 class RulePolicy(Policy):
-    """An update rule as a policy: a_x = δ / (1 + |δ|) and a_s = Δs / state_scale.
+    """An update rule as a policy: its outputs δ (displacement) and Δs (state step) become actions.
 
-    An episode then equals `npa_envs.rollout` of the rule up to rounding, unless the environment
-    clips state steps or observations. Actions are computed on the rule's device.
+    They are a_x = δ / (1 + |δ|), a fraction of α ε, and a_s = Δs / state_scale. An episode equals
+    `npa_envs.rollout` up to rounding, unless the environment clips state steps or observations.
 
     Args:
-        rule: The rule, which is not copied.
+        rule: The rule, which is not copied; actions are computed on its device.
         env: The environment, which must fit the rule; None: nothing is checked.
         state_scale: Largest state step of the environment, if `env` is None (dimensionless).
 
     Raises:
-        NPAError: The rule has uncorrected gradients or codes, divides, or does not fit `env`.
+        NPAError: The rule lacks `moment_correction`, has picture codes, divides, or misfits `env`.
     """
 
     def __init__(self, rule: NPARule, env: Any = None, state_scale: float = 1.0) -> None:
@@ -227,7 +227,7 @@ class PolicyRandom:
         self._streams: WorldRandom | None = None
 
     def next_step(self, world_count: int, device: torch.device) -> WorldRandom:
-        """Return the worlds' streams for the next step; a changed `world_count` restarts them."""
+        """Return each world's random stream, a step further; another `world_count` restarts all."""
         if self._streams is None or self._streams.world_count != world_count:
             seeds = range(self._seed, self._seed + world_count)
             # A substream, as an environment with the same seed uses these streams itself.

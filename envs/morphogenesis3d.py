@@ -121,7 +121,7 @@ class Morphogenesis3DEnv(NPAEnv):
     mesh, or a scene given by pictures. Particles are drawn as 3D Gaussians.
 
     Particles perceive and policies act as in `npa/Morphogenesis2D-v0`. Rules trained by gradient
-    with `npa-envs train morphogenesis3d` are policies, as there. Such a rule also has a network
+    with `npa-envs train morphogenesis3d` are policies (`RulePolicy`). Such a rule has a network
     that maps states to the particles' shapes and colours, so give it as `readout` too. Shipped
     rules need the worlds that they were trained in: `particle_count=16384`, `state_dim=24`, `eps`
     and `eps0` 0.1, `alpha=1.0`, `seed_radius` 0.7 (the mushroom's 0.5), `sigma=0.02`,

@@ -135,7 +135,7 @@ class CodeSpaces(ParticleSpaces):
 
 
 class PictureGoals(NamedTuple):
-    """The `context` of B episodes: goals, as indices of the rule's pictures, int64."""
+    """Which of the rule's pictures are the goals of B episodes: indices, int64."""
 
     goal: Tensor
     """The current goal, shape [B]."""
@@ -202,7 +202,7 @@ class ShapeshifterTask(RuleDrivenTask[Shapeshifter2DEnvConfig]):
     def step(
         self, x: Tensor, s: Tensor, action: Tensor, random: WorldRandom
     ) -> tuple[Tensor, Tensor]:
-        """Return positions and states after steps of the rule with the codes of `action`."""
+        """Return x and s after steps of the rule with codes `action`, shape [B, 1, code_dim]."""
         coded = Particles(x, self.rule.with_code(s, action))
         x, s, *_ = run_rule(self.rule, self.config, coded, self.config.rule_steps, random)
         return x, s

@@ -63,7 +63,7 @@ class TextureEnv(NPAEnv):
     and meshes particles gather and leave places empty; cells and stripes are made only of colours.
 
     Particles perceive and policies act as in `npa/Morphogenesis2D-v0`. Rules trained by gradient
-    with `npa-envs train texture` are policies, as there.
+    with `npa-envs train texture` are policies (`RulePolicy`).
 
     ## Reward
 

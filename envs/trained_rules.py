@@ -238,7 +238,7 @@ class RuleDrivenWorlds(BatchedWorlds):
         self.task.next_goals(self.episodes.elapsed, self.context, self.goal)
 
     def extra_info(self) -> dict[str, Tensor]:
-        """Return values that the task adds to infos by `context_info`, by name, [B, ...] each."""
+        """Return the task's own entries of infos (`context_info`): values [B, ...] by name."""
         return self.task.context_info(self.particles, self.context)
 
 

@@ -370,7 +370,7 @@ class RegisteredEnv(NamedTuple):
 
 
 def registration_of(env_id: Any) -> RegisteredEnv:
-    """Return what an environment id stands for; NPAError if it has no form of many worlds."""
+    """Return task class and settings of an environment id; NPAError if it cannot be batched."""
     if isinstance(env_id, str) and env_id in SPECIES_IDS:
         name, keywords = task_settings(env_id)
         steps = keywords.pop("max_cycles", DEFAULT_STEPS)

@@ -108,11 +108,11 @@ class Found(NamedTuple):
     """Values of the descriptors, in the order of `SearchWorld.axes`."""
 
 
-class Trials(NamedTuple):
-    """Results of G candidates that were run."""
+class Evaluations(NamedTuple):
+    """Results of G candidates, and the worlds in which they were evaluated."""
 
     found: list[Found | None]
-    """Result of each candidate; None where its worlds diverged or stopped changing."""
+    """Quality and descriptors of each; None where its worlds diverged or stopped changing."""
     worlds: Particles
     """The B worlds of each candidate at the end, positions [G, B, N, D] and so on."""
 
@@ -170,22 +170,22 @@ class Candidates:
         return rule
 
     @torch.no_grad()
-    def try_all(self, solutions: Numbers) -> Trials:
-        """Run and evaluate G candidates, with weights `solutions`, [G, W] in units of `scales`."""
+    def try_all(self, solutions: Numbers) -> Evaluations:
+        """Run candidates with weights `solutions`, [G, W] in units of `scales`; return results."""
         weights = torch.as_tensor(solutions * self.scales, dtype=torch.float32).to(self.device)
         batch_size = len(weights) if self.device.type == "cpu" else 1
-        batches = [self._try(batch) for batch in torch.split(weights, batch_size)]
+        batches = [self._evaluate_batch(batch) for batch in torch.split(weights, batch_size)]
         found = [result for batch in batches for result in batch.found]
-        return Trials(found, combined(torch.cat, [batch.worlds for batch in batches]))
+        return Evaluations(found, combined(torch.cat, [batch.worlds for batch in batches]))
 
-    def _try(self, weights: Tensor) -> Trials:
-        """Run and evaluate G candidates, with weights [G, W], in one batch of worlds."""
+    def _evaluate_batch(self, weights: Tensor) -> Evaluations:
+        """Run candidates with weights [G, W] in one batch; return their results and last worlds."""
         snapshots, speeds = self._run(weights)
         found = [
-            self._found(snapshots.map(lambda values: values[:, k]), float(speed))  # noqa: B023
+            self._result_of(snapshots.map(lambda values: values[:, k]), float(speed))  # noqa: B023
             for k, speed in enumerate(speeds)
         ]
-        return Trials(found, snapshots.map(lambda values: values[-1]))
+        return Evaluations(found, snapshots.map(lambda values: values[-1]))
 
     def _run(self, weights: Tensor) -> tuple[Particles, Tensor]:
         """Return worlds at T late times, [T, G, B, N, ...], and the `speed` of candidates, [G]."""
@@ -208,16 +208,16 @@ class Candidates:
         )
         return snapshots, speeds
 
-    def _found(self, snapshots: Particles, speed: float) -> Found | None:
+    def _result_of(self, snapshots: Particles, speed: float) -> Found | None:
+        """Return quality and descriptors; None if worlds came to rest (0) or diverged (NaN)."""
         quality = float(quality_of(snapshots))
-        # It is 0 or NaN where worlds came to rest or diverged.
         if not quality > 0.0:
             return None
         worlds = snapshots.map(lambda values: values.flatten(0, 1))
         return Found(quality, (speed, *self.crowding_and_mixing(worlds)))
 
     def crowding_and_mixing(self, worlds: Particles) -> tuple[float, float]:
-        """Return the descriptors `crowding` and `mixing` of `SearchWorld.axes`, averaged."""
+        """Return `crowding` (of the mean density) and mean `mixing`; see `SearchWorld.axes`."""
         colours = _colours(worlds)
         fields = perception_fields(worlds.x, colours, eps=self.world.eps)
         excess = math.log(float(fields.rho.mean()) / self._alone)

@@ -147,7 +147,7 @@ class GraphedStarts:
 
 
 class GraphedStart:
-    """Starts `size` worlds by a CUDA graph; if there are fewer, an index is repeated."""
+    """Starts `size` episodes by a CUDA graph; a world given twice starts as if given once."""
 
     def __init__(
         self, start: Callable[[Tensor], NeighbourState], size: int, device: torch.device

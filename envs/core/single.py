@@ -116,7 +116,7 @@ class NPAEnv(WorldsEnv, gymnasium.Env[Any, Any]):
         self._make_worlds(keywords, 1, None)
         self.observation_space = self.spaces.observation_space
         self.action_space = self.spaces.action_space
-        self._world = torch.zeros(1, dtype=torch.int64, device=self.task.device)
+        self._world_index = torch.zeros(1, dtype=torch.int64, device=self.task.device)
         self._key_generator: np.random.Generator | None = None
         self._lacks_reward = False
 
@@ -144,7 +144,7 @@ class NPAEnv(WorldsEnv, gymnasium.Env[Any, Any]):
         if seed is not None or self.np_random is not self._key_generator:
             self._key_generator = self.np_random
             keys = rng_keys(None, 1, self.np_random)
-        observation = self._change_worlds(self.worlds.start, self._world, keys)
+        observation = self._change_worlds(self.worlds.start, self._world_index, keys)
         info = self.losses_of(self.worlds.episodes.report.numbers[:, 0].tolist())
         info |= self._of_world(self.worlds.extra_info())
         return self.spaces.observation_output(observation[0]), info
@@ -190,7 +190,7 @@ class NPAEnv(WorldsEnv, gymnasium.Env[Any, Any]):
             raise NPAError("particles need a world: call reset first")
         x, s = number_tensor("x", x)[None], number_tensor("s", s)[None]
         placed = self.worlds.checked_particles(x, s, 1, self.config.particle_count)
-        observation = self._change_worlds(self.worlds.place, self._world, placed)
+        observation = self._change_worlds(self.worlds.place, self._world_index, placed)
         return self.spaces.observation_output(observation[0])
 
     def _of_world(self, values: dict[str, Tensor]) -> dict[str, Any]:

@@ -253,10 +253,10 @@ def first_options(arguments: Sequence[str]) -> argparse.Namespace:
 
 
 def resolve_run(arguments: Sequence[str], out_of: Callable[[Any], Path]) -> argparse.Namespace:
-    """Return `first_options`, with `--device cuda` if `--gpus` is given without a device.
+    """Return the options of `first_options`, which choose the defaults of others, and all `words`.
 
-    `--resume auto` becomes `--resume` if there is a checkpoint in the run's folder; otherwise it is
-    removed. `out_of` returns that folder for these options.
+    `--gpus` without a device adds `--device cuda`. `--resume auto` becomes `--resume` if the run's
+    folder, which `out_of` returns for these options, has a checkpoint; otherwise it is removed.
     """
     first = first_options(arguments)
     if first.gpus is not None and first.device is None:

@@ -1,4 +1,4 @@
-"""No command: the end of `npa-envs train`, which measures and films the rule; its model card."""
+"""The end of `npa-envs train` (no command of its own): measures, films and model card of a rule."""
 
 from __future__ import annotations
 

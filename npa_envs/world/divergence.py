@@ -120,7 +120,7 @@ class DivergenceWatch:
 
     @torch.no_grad()
     def check(self, worlds: Particles) -> None:
-        """Keep the number of this check and the values of worlds that are newly not finite."""
+        """Record worlds that are not finite for the first time: index of this check, values."""
         values = torch.cat((worlds.x, worlds.s), dim=2)
         is_first = ~values.isfinite().all(dim=(1, 2)) & (self._first_check < 0)
         self._first_check.masked_fill_(is_first, self._checks)

@@ -208,7 +208,7 @@ class StaticStep(Step):
         return particles._replace(x=self.x).gather(self.sorted.original_index)
 
     def draw(self, like: Tensor, steps: int, generator: Randomness | None) -> Iterator[Draws]:
-        """Yield each step's rows; a few launches assign those of up to 16 steps together."""
+        """Yield each step's active particles (`Draws.rows`), listed for up to 16 steps at once."""
         total, physics = like.shape[0] * like.shape[1], self.physics
         together = max(min(16, MAX_STORED_ROWS // total), 1)
         for first in range(0, steps, together):

@@ -151,7 +151,7 @@ def row_search(space: SimpleNamespace, periodic: bool) -> SimpleNamespace:
 
     @wp.func
     def count_runs(domain: Domain, to_column: int):
-        """Return the number of runs that `run_cells` has around a line, up to `to_column`."""
+        """Return how many runs of adjacent cells `run_cells` has, with `to_column` as its `end`."""
         runs = space.cells_around(domain, 1)
         if wp.static(space_dim == 3):
             runs *= space.cells_around(domain, wp.static(space_dim - 1))

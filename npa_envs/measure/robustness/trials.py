@@ -342,7 +342,7 @@ def pull_together(x: Tensor, s: Tensor, random: WorldRandom, box: Box) -> tuple[
 def _around(
     x: Tensor, s: Tensor, centre: Tensor, box: Box, change: Callable[..., tuple[Tensor, Tensor]]
 ) -> tuple[Tensor, Tensor]:
-    """Return x and s after `change` of the offsets of nearest images from `centre`, [B, D]."""
+    """Return x and s, changed by `change` in coordinates whose origin is `centre`, [B, D]."""
     away, s = change(offsets_from(x, centre, box), s, centre=torch.zeros_like(centre))
     return nearest_image(away + centre[:, None], box), s
 
