@@ -56,7 +56,7 @@ class TorchRecordEpisodeStatistics(RewardSums):
         return deque(returns, maxlen=self._returns.maxlen)
 
     def use_sums(self, rewards: Tensor, sums: Tensor) -> tuple[Tensor, dict[str, Any]]:
-        """Return the rewards unchanged, and infos with statistics of the episodes that ended."""
+        """Return rewards [B] unchanged, and infos of ended episodes; `sums` has their returns."""
         ended, device = self.clock.ended, sums.device
         if not ended.any():
             return rewards, {}

@@ -109,9 +109,9 @@ class RowVecEnv(VecEnv):
         self.vector_env.close()
 
     def seed(self, seed: int | None = None) -> list[int | None]:
-        """Set the seeds of the next reset, seed + k for world k; return each row's seed.
+        """Set the seeds of the next reset, seed + k for world k; return that of each row's world.
 
-        If `seed` is None, it is random.
+        A row is a world, or a particle of one. If `seed` is None, it is random.
         """
         first = int(np.random.default_rng().integers(2**32) if seed is None else seed)
         worlds = np.arange(self.world_count).repeat(self.row_count)

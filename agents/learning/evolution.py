@@ -33,7 +33,7 @@ MAX_HIDDEN = 2**27
 
 @dataclass(frozen=True, kw_only=True)
 class EvolutionOptions:
-    """Options of evolution."""
+    """Options of sep-CMA-ES, the evolution strategy that changes the weights of rules."""
 
     population: int = 32
     """Number of candidates of a generation, at least 4."""

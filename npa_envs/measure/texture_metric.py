@@ -119,11 +119,11 @@ class TextureMetric:
         return torch.stack(distances)
 
     def _projections(self, image: Tensor, wrap: bool) -> Tensor:
-        """Return quantiles of the projections of an image's patches, [DIRECTIONS, R²]."""
+        """Project an R x R image's patches on directions; return quantiles, [DIRECTIONS, R²]."""
         waves = torch.fft.rfft2(image)
         projected = torch.fft.irfft2((waves * self._filters).sum(1), s=image.shape[-2:])
         count = image.shape[-1] ** 2
-        if not wrap:
+        if not wrap:  # Only patches that do not cross the image's edges.
             inside = image.shape[-1] - self._side + 1
             projected = projected[:, :inside, :inside]
         return quantiles(projected.flatten(1), count)

@@ -103,9 +103,9 @@ def invariants(perception: Tensor, mixing: Tensor, sizes: VectorSizes) -> tuple[
 def steered(output: Tensor, mixed: Tensor, steering: Tensor, sizes: VectorSizes) -> Tensor:
     """Return an equivariant rule's updates [δ (D) ; Δs (C)] from its network's `output` [g ; Δs].
 
-    The displacement is δ = Σ_a relu(g_a) steering_a u_a: mixed vectors u_a, where chiral also those
-    turned by 90 degrees, times gates g_a, times trained factors `steering`, shape [gate_count]. Δs
-    are the changes of states; `output` has shape [..., gate_count + C].
+    The vectors u_a are `mixed`, and if the rule is chiral also `mixed` turned by 90 degrees. Each
+    has a gate g_a and a trained factor, `steering` [gate_count]. The displacement is
+    δ = Σ_a relu(g_a) steering_a u_a. Δs changes the state; `output` is [..., gate_count + C].
     """
     gates = torch.relu(output[..., : sizes.gate_count]) * steering
     along = torch.cat((mixed, _turned(mixed)), dim=-2) if sizes.chiral else mixed

@@ -162,7 +162,8 @@ class TrainingCycle:
         )
         self.optimiser = RuleOptimiser(self.batch.parameters, config, rule)
         self.statistics = LossStatistics(self.batch)
-        # Indices in the pool and ages of the batch's worlds, which graphs write.
+        # What graphs share: `_draw_worlds` writes the batch's indices in the pool, ages and start
+        # worlds; `_store_worlds` reads these and `_steps`, and adds to `_replaced`.
         self._index, self._age = (torch.zeros_like(self._batch_indices) for _ in range(2))
         self._steps, self._replaced = (torch.zeros_like(self._index[0]) for _ in range(2))
         self._start_worlds = first_worlds.map(torch.empty_like)
@@ -184,7 +185,7 @@ class TrainingCycle:
     def run(self, number: int, least_progress: float = 0.0) -> int:
         """Train for iteration `number`, from 0 on, and return the number of its rollout's steps.
 
-        least_progress: Lower bound on the progress of the learning rate's schedule, in [0, 1].
+        `least_progress` is the least progress of the learning rate's schedule, in [0, 1].
         """
         lo, hi = self._config.steps
         steps = int(torch.randint(lo, hi, (), generator=self.random.run))
@@ -207,9 +208,8 @@ class TrainingCycle:
         """Return which worlds of the batch a start world replaces, bool, shape [B]; None: none.
 
         Every `seed_interval` iterations there are `fresh_count` of them: the first of the batch.
-        With per-world streams each world of the batch stays in its own section of the pool. Then
-        they are the first `fresh_count` worlds, the next time the next `fresh_count`, and so on, so
-        that start worlds come into all sections.
+        With per-world streams, where each world stays in its own section of the pool, they are the
+        next `fresh_count` worlds each time, so that start worlds come into all sections.
         """
         config = self._config
         if config.ages or number % config.seed_interval != 0:

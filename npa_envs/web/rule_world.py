@@ -452,7 +452,7 @@ class RunWorld(RuleWorld):
         self.count = sum(self.counts)
 
     def describe(self) -> WorldEvent:
-        """Return the event "world", in which the page has no rules to choose from."""
+        """Return the event "world" for the page; its list of rules to choose from is empty."""
         return super().describe() | {
             "title": self._run_folder.path.resolve().name,
             "note": f"a training run, iteration {self._iteration}",

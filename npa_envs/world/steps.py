@@ -401,10 +401,10 @@ class SpeciesStep(Step):
     def _perceived(
         self, species: Species, z: Tensor, fields: Tensor | None, particle: Tensor
     ) -> Tensor:
-        """Return what a species' rule perceives, from its rows of perception z [R, P].
+        """Return what a species' rule perceives, from its K rows of perception z [K, P].
 
         Densities are divided by the species' own number. `fields` has all species' densities and
-        gradients, which are appended, or is None. `particle` [R] has each row's particle.
+        gradients, which are appended, or is None. `particle` [K] has each row's particle.
         """
         ratio, space_dim = species.count_ratio, self.physics.space_dim
         if ratio != 1.0 and self.physics.terms.density_gradient:
@@ -427,7 +427,7 @@ def _rows_of_species(
 ) -> tuple[Tensor, Tensor]:
     """Return the rows of perception of a species' active particles, and these particles' indices.
 
-    Both are int64, shape [R]. On CUDA R does not depend on the mask, so that nothing waits for the
+    Both are int64, shape [K]. On CUDA K does not depend on the mask, so that nothing waits for the
     device; unused entries have the row `row_count`.
     """
     row = row_of[:, species.particles].reshape(-1).long()
@@ -458,7 +458,7 @@ def _recounted(scaled: Tensor, ratio: float) -> Tensor:
 
 
 def _update_of(species: Species, z: Tensor) -> Tensor:
-    """Return a species' updates [R, A] of rows z [R, P]; `network` may append columns of zeros."""
+    """Return a species' updates [displacement | state changes | zeros] for perceptions z [K, P]."""
     rule = species.rule
     if species.network is None:
         update: Tensor = rule(z[:, : rule.perception_dim])

@@ -452,7 +452,7 @@ def _loss_curves(
 ) -> list[LossCurve]:
     """Run undamaged copies and damaged worlds in one batch; return the loss curve of each damage.
 
-    With `control`, the first curve is that of undamaged worlds with other masks.
+    With `control`, the first curve is that of undamaged worlds with other random update masks.
     """
     steps = trial.plan.heal_steps
     masks, other_masks = (

@@ -91,9 +91,9 @@ def _check_size(largest: int, world_count: int, view: Any) -> None:
 
 
 def sort_splats(splats: Splats, view: Any) -> tuple[Tensor, Tensor, Tensor]:
-    """Return each cell's first splat, and by cell footprints [B N, 8] and particles [B N].
+    """Sort splats by cell; return each cell's first, all footprints [B N, 8], all particles [B N].
 
-    A footprint is a splat in pixels; `view` is the window and its pixels, by `make_view`.
+    The first and particles are indices. A footprint is a splat in pixels of `view` (`make_view`).
     """
     x, total = splats.x, splats.total
     world_count, particle_count, _ = x.shape

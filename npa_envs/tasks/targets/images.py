@@ -247,7 +247,7 @@ def _margin(image: Image.Image, pitch: float) -> int:
 
 
 def _sample(padded: Image.Image, span: int, pitch: float) -> Image.Image:
-    """Return the middle `span` pixels of a picture, and a few around, scaled by 1 / `pitch`."""
+    """Return the middle of `padded` scaled by 1 / `pitch`, ceil(span / pitch) + 2 pixels a side."""
     side = math.ceil(span / pitch) + 2
     low = 0.5 * (padded.width - side * pitch)
     high = low + side * pitch

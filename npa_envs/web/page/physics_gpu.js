@@ -1,6 +1,5 @@
-// The step of physics.js with densities, perception and networks on the GPU, through WebGPU. The CPU sorts the
-// particles before, and moves them after; both are a small part of the time. The head of physics.js says which
-// formulas are here as well.
+// The step of physics.js with densities, perception and networks on the GPU, through WebGPU. The CPU sorts and moves
+// particles, a small part of the time. The head of physics.js says which formulas are here as well.
 
 import { CELLS_PER_RADIUS, MAX_CELLS, MOMENT_THRESHOLD, SQUARED_MOMENT_SOFTENING } from "./physics.js";
 
@@ -14,7 +13,7 @@ export async function openDevice() {
   return adapter ? adapter.requestDevice() : null;
 }
 
-// Pieces of shaders, in WGSL. Cells around that of sorted particle i: `counts` along each axis, from cell `first` on.
+// Pieces of shaders, in WGSL. Sorted particle i is at `own`; cells around it: `counts` on each axis, from `first` on.
 const CELLS_AROUND = `
     let own = points[i].xyz;
     let cell = home[i];
@@ -23,7 +22,8 @@ const CELLS_AROUND = `
     // In a small box each cell is visited once.
     let first = select(at + world.cells.xyz - vec3u(${CELLS_PER_RADIUS}), vec3u(0), counts < vec3u(${SPAN}));`;
 
-// The vector d to particle j, its squared length, and the smoothing kernel w and slope k there.
+// The vector d from i to particle j, the smoothing kernel w there, and k, where k d is the spiky kernel's gradient.
+// `weight` and `slope` are the norms of these kernels; `per` is 1 / side of the box, 0 in open space.
 const KERNELS = `
             var d = points[j].xyz - own;
             d -= world.sides.xyz * round(d * world.per.xyz);
@@ -34,7 +34,7 @@ const KERNELS = `
             let w = world.weight * left * left * left;
             let k = select(0.0, world.slope * (world.eps - length) * (world.eps - length) / length, square > 0.0);`;
 
-// Visits all neighbours j of sorted particle i.
+// Runs `body`, WGSL that may read i, j, d, w and k, for all neighbours j of sorted particle i, itself included.
 function visitNeighbours(body) {
   return `${CELLS_AROUND}
     for (var cz = 0u; cz < counts.z; cz++) {
