@@ -322,16 +322,15 @@ class PPOLearner:
         within_kl.fill_(1.0)
         for _ in range(self.options.epochs):
             self.minibatches.shuffle()
-            critic_sums, rules_sums = graphed.sum_weights(batch.acted)
-            self.processes.reduce([critic_sums, rules_sums])
+            (weight_sums,) = graphed.sum_weights(batch.acted)
+            self.processes.reduce([weight_sums])
             for minibatch in range(self.minibatches.count):
                 if rules_learn:
-                    compute = graphed.compute_gradients[minibatch]
-                    (kl_sums,) = compute(critic_sums, rules_sums, *batch)
+                    (kl_sums,) = graphed.compute_gradients[minibatch](weight_sums, *batch)
                     self.processes.reduce([*gradients_of(critic), *gradients_of(actor), kl_sums])
                     graphed.descend_both(kl_sums, rules_rate, within_kl)
                 else:
-                    self._compute_critic_gradients(minibatch, critic_sums, batch)
+                    self._compute_critic_gradients(minibatch, weight_sums, batch)
                     self.processes.reduce(gradients_of(critic))
                     self._descend(critic)
             # The only synchronisation with the device.
@@ -339,37 +338,38 @@ class PPOLearner:
                 break
         self.actor.set_noise(self.options.noise_factor(remaining_budget, schedule.last_noise))
 
-    def sum_weights(self, acted: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the sum of `acted` (critic) and of ratio weights (rules) of each minibatch."""
-        critic_sums, rules_sums = [], []
+    def sum_weights(self, acted: Tensor) -> tuple[Tensor]:
+        """Return each minibatch's sums of `acted`: the critic's, the rules'; [minibatches, 2]."""
+        sums = []
         for minibatch, critic_index in enumerate(self.minibatches.indices[-1]):
             rows = torch.cat([group for (group,) in self._rule_rows(minibatch, [acted])])
-            critic_sums.append(acted[critic_index].sum())
-            rules_sums.append(self._ratio_weights(rows).sum())
-        return torch.stack(critic_sums), torch.stack(rules_sums)
+            sums += [acted[critic_index].sum(), self._ratio_weights(rows).sum()]
+        return (torch.stack(sums).view(-1, 2),)
 
     def compute_gradients(
-        self, minibatch: int, critic_sums: Tensor, rules_sums: Tensor, *fields: Tensor
+        self, minibatch: int, weight_sums: Tensor, *fields: Tensor
     ) -> tuple[Tensor]:
         """Write the gradients of critic and rules for a minibatch of the round of these `fields`.
 
         Return the sums of the minibatch's KL estimates [nats] and of their weights, shape [2].
         """
         batch = Round(*fields)
-        self._compute_critic_gradients(minibatch, critic_sums, batch)
-        objective, kl_sums = self._objective(minibatch, rules_sums, batch)
+        self._compute_critic_gradients(minibatch, weight_sums, batch)
+        objective, kl_sums = self._objective(minibatch, weight_sums, batch)
         set_gradients(self.optimisers["actor"], -objective)
         return (kl_sums,)
 
-    def _compute_critic_gradients(self, minibatch: int, critic_sums: Tensor, batch: Round) -> None:
+    def _compute_critic_gradients(self, minibatch: int, weight_sums: Tensor, batch: Round) -> None:
         index = self.minibatches.indices[-1][minibatch]
         worlds = Round(*(values[index] for values in batch))
         error = (self.critic(worlds.observations) - worlds.targets) / self.critic.scale
         squares = (worlds.acted * error.square()).sum()
-        loss = 0.5 * squares / critic_sums[minibatch].clamp(min=1.0)
+        loss = 0.5 * squares / weight_sums[minibatch, 0].clamp(min=1.0)
         set_gradients(self.optimisers["critic"], loss)
 
-    def _objective(self, minibatch: int, rules_sums: Tensor, batch: Round) -> tuple[Tensor, Tensor]:
+    def _objective(
+        self, minibatch: int, weight_sums: Tensor, batch: Round
+    ) -> tuple[Tensor, Tensor]:
         """Return PPO's clipped objective of a minibatch, shape [], and its KL sums, shape [2]."""
         options, actor = self.options, self.actor
         groups = [Round(*rows) for rows in self._rule_rows(minibatch, batch)]
@@ -391,7 +391,7 @@ class PPOLearner:
         kl_sums = torch.stack((divergence, acted.sum()))
         if options.ratio == "world":
             log_ratio = particle_means(log_ratio, acted)
-        weights, total = self._ratio_weights(acted), rules_sums[minibatch]
+        weights, total = self._ratio_weights(acted), weight_sums[minibatch, 1]
         objective = clipped_objective(
             log_ratio, advantages, weights, total, clip=options.clip_range
         )
@@ -537,7 +537,7 @@ def _copy_each(sources: Sequence[Tensor], targets: Sequence[Tensor]) -> None:
 
 
 class GraphedFunctions:
-    """A `PPOLearner`'s methods, by name: `GraphedFunction`s (CUDA graphs) with fixed tensors."""
+    """Methods of a `PPOLearner` of the same names, as graphs with their inputs and outputs."""
 
     def __init__(self, learner: PPOLearner) -> None:
         buffers, count = learner.buffers, learner.minibatches.count
@@ -560,10 +560,10 @@ class GraphedFunctions:
         # Updates share memory.
         pool = torch.cuda.graph_pool_handle() if device.type == "cuda" else None
         graph, batch = partial(graph, pool=pool), buffers.round
-        weight_sums, kl_sums, within_kl = [zeros(count), zeros(count)], zeros(2), buffers.within_kl
-        self.sum_weights = graph(learner.sum_weights, [batch.acted], weight_sums)
+        weight_sums, kl_sums, within_kl = zeros(count, 2), zeros(2), buffers.within_kl
+        self.sum_weights = graph(learner.sum_weights, [batch.acted], [weight_sums])
         self.compute_gradients = [
-            graph(learner.compute_gradients, [*weight_sums, *batch], [kl_sums], minibatch)
+            graph(learner.compute_gradients, [weight_sums, *batch], [kl_sums], minibatch)
             for minibatch in range(count)
         ]
         self.descend_both = graph(
