@@ -57,7 +57,7 @@ class AgentsEnv(ShownEnv):
     def _start(self, worlds: NDArray[np.int64], seed: Any, key_seed: Any) -> Tensor:
         """Start episodes in worlds, int64 [B']; return all worlds' perception, [B, N, P].
 
-        `seed` is that of `reset`. `key_seed` seeds `np_random`, for random streams without a seed.
+        `seed` is that of `reset`; where it gives none, streams begin at seeds from `key_seed`.
         """
         keys, batch = None, self.worlds
         # The first reset may have failed, so that there are no sequences of episodes yet.

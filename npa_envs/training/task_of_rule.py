@@ -145,7 +145,7 @@ def tasks_of_codes(
 
 
 def _world_of(path: Path, metadata: Mapping[str, str]) -> dict[str, Any]:
-    """Return the fields of the task's configuration that a file of `npa-envs search` names."""
+    """Return the task's fields that `npa-envs search` stored in a rule file; {} without any."""
     fields = None
     with contextlib.suppress(NPAError):
         fields = parse_json(metadata.get("world", "{}"))

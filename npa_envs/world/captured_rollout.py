@@ -237,7 +237,7 @@ class CapturedRollout:
         return [tensor._version for tensor in self._inputs]
 
     def _cotangents_of(self, steps: int) -> list[Tensor]:
-        """Return the buffers for gradients by the worlds that a rollout of `steps` returns."""
+        """Return buffers for dL/dworlds of the worlds that a rollout of `steps` returns."""
         interval = self._spec.keep_every
         count = None if interval is None else steps // interval
         if count not in self._cotangents:

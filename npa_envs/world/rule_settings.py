@@ -58,7 +58,7 @@ def rule_settings(rule: nn.Module, device: torch.device) -> dict[str, Hashable]:
 
 
 def _setting(value: Any, device: torch.device, *, in_container: bool = False) -> Hashable:
-    """Return a key that changes if an attribute's value does, or an entry of a container."""
+    """Return a hashable key of the value of an attribute, or of an entry of a container."""
     if isinstance(value, NUMBERS):
         return type(value), value
     if isinstance(value, Tensor):
