@@ -32,7 +32,7 @@ class Particles(NamedTuple):
 
     def moved(self, x: Tensor, s: Tensor, path_length: Tensor) -> Particles:
         """Return the worlds with other positions, states and path lengths."""
-        return self.with_fields(x=x, s=s, path_length=path_length)
+        return Particles(x, s, path_length, *self[3:])
 
     def per_particle(self) -> tuple[Tensor, Tensor, Any]:
         """Return x, s and the path lengths, in the order that `update_particles` takes."""
