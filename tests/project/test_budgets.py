@@ -144,13 +144,13 @@ BUDGETS = {
     "names of classes used twice": Budget(classes_named_twice, 0, 0),
     "places that draw masks": Budget(places_that_draw_masks, 1, 1),
     "options of npa-envs train": Budget(options_of_train, 76, 76),
-    "source files": Budget(lambda: len(files(*PACKAGES, suffixes=SOURCES)), 270, 270),
-    "source lines": Budget(lambda: lines(files(*PACKAGES, suffixes=SOURCES)), 59_900, 58_000),
-    "test lines": Budget(lambda: lines(files("tests")), 32_000, 32_000),
+    "source files": Budget(lambda: len(files(*PACKAGES, suffixes=SOURCES)), 282, 282),
+    "source lines": Budget(lambda: lines(files(*PACKAGES, suffixes=SOURCES)), 63_400, 63_400),
+    "test lines": Budget(lambda: lines(files("tests")), 34_000, 34_000),
     "words of docs": Budget(
         lambda: words([p for p in files("docs", suffixes=(".md",)) if p.parent.name == "docs"]),
-        45_000,
-        45_000,
+        48_000,
+        48_000,
     ),
     "words of docs/environments": Budget(
         lambda: words(files("docs/environments", suffixes=(".md",))), 18_000, 18_000
