@@ -16,7 +16,7 @@ from PIL import EpsImagePlugin, Image, UnidentifiedImageError, features
 
 from npa_envs.atomic_files import read_bytes
 from npa_envs.errors import MissingDependencyError, NPAError, importing, shown
-from npa_envs.tasks.targets.picture_modes import Mask, kind_of_tiff, to_rgba
+from npa_envs.tasks.targets.picture_modes import Mask, correct_tiles, kind_of_tiff, to_rgba
 
 OPAQUE = 128
 """Minimum alpha of a pixel that belongs to a target, out of 255."""
@@ -98,6 +98,7 @@ def open_image(path: Path) -> Image.Image:
             warnings.simplefilter("ignore")
             with Image.open(io.BytesIO(content), formats=_formats(content, name)) as opened:
                 _check_area(opened.size, name)
+                correct_tiles(opened)
                 opened.load()
                 # A format inside of another may have another size.
                 _check_area(opened.size, name)
@@ -108,7 +109,7 @@ def open_image(path: Path) -> Image.Image:
         kind = kind_of_tiff(content)
         if kind:
             raise NPAError(
-                f"target {name} is a {kind}, which Pillow does not read: save it as PNG"
+                f"target {name} is a {kind}, which Pillow does not read, or damaged: save it as PNG"
             ) from error
         raise NPAError(
             f"target {name} must be a picture ({', '.join(FORMATS)}, AVIF, HEIC), "
@@ -119,8 +120,8 @@ def open_image(path: Path) -> Image.Image:
     except Exception as error:
         # Pillow's decoders report damaged data by exceptions of many kinds.
         raise NPAError(
-            f"target {name} cannot be decoded, it is truncated or damaged ({shown(error)}): "
-            "save the picture again, as PNG"
+            f"target {name} cannot be decoded, it is truncated or damaged, or of a kind that "
+            f"Pillow does not read ({shown(error)}): save the picture again, as PNG"
         ) from error
 
 

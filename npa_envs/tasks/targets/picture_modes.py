@@ -23,8 +23,10 @@ DARK = 0.25
 _CLIPPED = 1.0 + 0.5 / 255.0
 _SRGB_GAMMA = 1.0 / 2.2
 _MODES_OF_PROFILES = {"RGB": "RGB", "GRAY": "L", "CMYK": "CMYK", "Lab": "LAB"}
-_BITS, _PHOTOMETRIC, _SAMPLE_FORMAT, _SUBFILES = 258, 262, 339, 330  # tags of TIFF
+_BITS, _PHOTOMETRIC, _PLANES, _SUBFILES, _SAMPLE_FORMAT = 258, 262, 284, 330, 339  # tags of TIFF
+_SEPARATE = 2  # of _PLANES
 _SIGNED, _FLOAT = 2, 3  # of _SAMPLE_FORMAT
+_NATIVE_MODES = {"F;32BF": "F;32NF", "I;32BS": "I;32NS", "I;16BS": "I;16NS"}
 
 
 class _Scale(NamedTuple):
@@ -72,6 +74,26 @@ def to_rgba(opened: ImageFile.ImageFile, content: bytes, name: str) -> Image.Ima
         alpha = np.asarray(rgba.getchannel("A")) * there
         rgba.putalpha(Image.fromarray(alpha.astype(np.uint8)))
     return rgba
+
+
+def correct_tiles(opened: ImageFile.ImageFile) -> None:
+    """Correct, before a TIFF is loaded, how Pillow unpacks samples of more than 8 bits.
+
+    It swaps the bytes of big-endian ones that libtiff has swapped before, and takes planes of 16
+    bits, where they are not compressed, for planes of 8.
+    """
+    if opened.format != "TIFF":
+        return
+    tags, tiles = _tags(opened), []
+    planes = tags.get(_PLANES) == _SEPARATE and max(tags.get(_BITS, (1,))) == 16
+    for tile in opened.tile:
+        mode, *others = tile.args
+        if tile.codec_name == "libtiff":
+            mode = _NATIVE_MODES.get(mode, mode)
+        elif planes and len(mode) == 1:
+            mode += ";16B" if tags.prefix == b"MM" else ";16L"
+        tiles.append(tile._replace(args=(mode, *others)))
+    opened.tile = tiles
 
 
 def kind_of_tiff(content: bytes) -> str:
@@ -135,8 +157,8 @@ def _to_eight_bits(image: Image.Image, scale: _Scale, name: str) -> tuple[Image.
     if scale.inverted:
         levels = 1.0 - levels
     elif 0.0 < largest < DARK:
-        text = f"its largest value is {largest * scale.white:g} of {scale.white:g}"
-        left_out(name, text, what="dark")
+        stored = f"{largest * scale.white:g} of {scale.white:.10g}"
+        left_out(name, f"its largest value is {stored}: scale its values", what="dark")
     levels = np.where(numbers, levels, 0.0) * 255.0
     return Image.fromarray(levels.clip(0, 255).astype(np.uint8)), numbers
 
