@@ -192,6 +192,14 @@ def test_floats_on_another_scale_and_kinds_that_pillow_cannot_read_are_named(tmp
             open_image(tmp_path / f"{name}.tif")
 
 
+def test_palettes_of_tiffs_with_8_bits_are_not_black(tmp_path):
+    for factor in (1, 257):
+        palette = [factor * level for level in (0, 200, *[0] * 254, 0, 60, *[0] * 254, 0, 30)]
+        indices, entries = DISK.astype("u1"), {"t320": palette + [0] * 254}
+        write_tiff(tmp_path / "disk.tif", indices, photometric=3, **entries)
+        assert tuple(pixels(tmp_path / "disk.tif")[INSIDE]) == (200, 60, 30, 255)
+
+
 COLOUR = (0.25, 0.5, 1.0)
 
 
@@ -297,6 +305,11 @@ def test_an_embedded_profile_gives_the_colours_of_littlecms(tmp_path, case):
     rgba = pixels(path)[5, 5]
     assert tuple(rgba[:3]) == tuple(expected[:3])
     assert rgba[3] == (200 if mode.endswith("A") else 255)
+    if mode == "L":
+        deep = np.full((16, 24), 257 * own.convert("L").getpixel((5, 5)))
+        embedded = (b"iCCP", b"icc\0\0" + zlib.compress(icc))
+        write_png(tmp_path / "deep.png", deep, 16, 0, embedded)
+        assert tuple(pixels(tmp_path / "deep.png")[5, 5]) == tuple(rgba)
     if mode != "LAB":
         assert abs(rgba[:3] - np.asarray(image.convert("RGB"))[5, 5]).max() > 20
 

@@ -102,7 +102,7 @@ def open_image(path: Path) -> Image.Image:
                 opened.load()
                 # A format inside of another may have another size.
                 _check_area(opened.size, name)
-                return to_rgba(opened, content, str(path))
+                return to_rgba(opened, content, name[1:-1])
     except Image.DecompressionBombError as error:
         raise _too_large(name, "more") from error
     except UnidentifiedImageError as error:
@@ -140,6 +140,8 @@ def _formats(content: bytes, name: str) -> tuple[str, ...]:
                 "pip install --upgrade pillow, or save it as PNG"
             )
         return (*FORMATS, "AVIF")
+    if not any(brand in brands for brand in (b"hei", b"hev", b"mif1", b"msf1")):
+        return FORMATS
     hint = "pip install pillow-heif, or save it as PNG"
     with importing("pillow-heif", f"target {name}, a HEIC picture,", hint):
         import pillow_heif

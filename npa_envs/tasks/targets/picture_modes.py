@@ -24,6 +24,7 @@ _CLIPPED = 1.0 + 0.5 / 255.0
 _SRGB_GAMMA = 1.0 / 2.2
 _MODES_OF_PROFILES = {"RGB": "RGB", "GRAY": "L", "CMYK": "CMYK", "Lab": "LAB"}
 _BITS, _PHOTOMETRIC, _PLANES, _SUBFILES, _SAMPLE_FORMAT = 258, 262, 284, 330, 339  # tags of TIFF
+_COLOURS = 320
 _SEPARATE = 2  # of _PLANES
 _SIGNED, _FLOAT = 2, 3  # of _SAMPLE_FORMAT
 _NATIVE_MODES = {"F;32BF": "F;32NF", "I;32BS": "I;32NS", "I;16BS": "I;16NS"}
@@ -53,6 +54,10 @@ def to_rgba(opened: ImageFile.ImageFile, content: bytes, name: str) -> Image.Ima
         left_out(name, "all its frames, pages or pictures but the first")
     is_png = opened.format == "PNG"
     image = ImageOps.exif_transpose(opened)
+    palette = _tags(opened).get(_COLOURS, ()) if image.mode == "P" else ()
+    if 0 < max(palette, default=0) < 256:
+        # Some programs write colours of 8 bits, of which Pillow takes the upper half of 16.
+        image.putpalette(np.array(palette, np.uint8).reshape(3, -1).T.tobytes())
     there = _not_transparent(image, content) if is_png else None
     if image.mode.startswith("I") or image.mode == "F" or scale.kind == _SIGNED:
         image, numbers = _to_eight_bits(image, scale, name)
@@ -143,7 +148,7 @@ def _to_eight_bits(image: Image.Image, scale: _Scale, name: str) -> tuple[Image.
     largest = float(values.max(initial=0.0))
     if scale.kind == _FLOAT and 2 * (values > BRIGHT).sum() > (values > 0.0).sum():
         raise NPAError(
-            f"target {shown(name)} has floats, of which 1 is white, but most of its values above 0 "
+            f"target {name!r} has floats, of which 1 is white, but most of its values above 0 "
             f"are above {BRIGHT:g}, and the largest is {largest:g}: divide them by their white, or "
             "save it with 8 or 16 bits"
         )
@@ -160,7 +165,9 @@ def _to_eight_bits(image: Image.Image, scale: _Scale, name: str) -> tuple[Image.
         stored = f"{largest * scale.white:g} of {scale.white:.10g}"
         left_out(name, f"its largest value is {stored}: scale its values", what="dark")
     levels = np.where(numbers, levels, 0.0) * 255.0
-    return Image.fromarray(levels.clip(0, 255).astype(np.uint8)), numbers
+    grey = Image.fromarray(levels.clip(0, 255).astype(np.uint8))
+    grey.info = image.info
+    return grey, numbers
 
 
 def _not_transparent(image: Image.Image, content: bytes) -> Mask | None:
