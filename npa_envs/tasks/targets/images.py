@@ -106,8 +106,7 @@ def open_image(path: Path) -> Image.Image:
     except Image.DecompressionBombError as error:
         raise _too_large(name, "more") from error
     except UnidentifiedImageError as error:
-        kind = kind_of_tiff(content)
-        if kind:
+        if kind := kind_of_tiff(content):
             raise NPAError(
                 f"target {name} is a {kind}, which Pillow does not read, or damaged: save it as PNG"
             ) from error
