@@ -102,7 +102,7 @@ def open_image(path: Path) -> Image.Image:
                 opened.load()
                 # A format inside of another may have another size.
                 _check_area(opened.size, name)
-                return to_rgba(opened, content, name[1:-1])
+                return to_rgba(opened, content, str(path))
     except Image.DecompressionBombError as error:
         raise _too_large(name, "more") from error
     except UnidentifiedImageError as error:

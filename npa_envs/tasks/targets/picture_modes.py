@@ -136,7 +136,7 @@ def _to_eight_bits(
     largest = float(values.max(initial=0.0))
     if kind == _FLOAT and 2 * (values > BRIGHT).sum() > (values > 0.0).sum():
         raise NPAError(
-            f"target {name!r} has floats, of which 1 is white, but most of its values above 0 "
+            f"target {shown(name)} has floats, of which 1 is white, but most of its values above 0 "
             f"are above {BRIGHT:g}, and the largest is {largest:g}: divide them by their white, or "
             "save it with 8 or 16 bits"
         )
