@@ -26,7 +26,7 @@ from npa_envs.tasks.targets.views import (
 
 def ball(radius=0.5, colour=(0.2, 0.6, 1.0)):
     sphere = pytest.importorskip("trimesh").creation.uv_sphere(radius, count=(60, 48))
-    colours = np.broadcast_to(colour, sphere.vertices.shape).astype(np.float64)
+    colours = np.broadcast_to(colour, (*sphere.faces.shape, 3)).astype(np.float64)
     return Mesh(np.array(sphere.vertices), np.array(sphere.faces), colours)
 
 
@@ -36,7 +36,7 @@ def test_built_in_meshes_fit_the_ball_and_face_outward(name):
     assert np.linalg.norm(mesh.vertices, axis=1).max() == pytest.approx(RADIUS)
     assert mesh.colours.min() >= 0.0
     assert mesh.colours.max() <= 1.0
-    assert len(np.unique(mesh.colours.round(3), axis=0)) >= 3
+    assert len(np.unique(mesh.colours.reshape(-1, 3).round(3), axis=0)) >= 3
     # The volume under triangles that face outward is positive, and no cylinder is larger.
     a, b, c = (mesh.vertices[mesh.faces[:, k]] for k in range(3))
     volume = (a * np.cross(b, c)).sum() / 6.0
@@ -58,7 +58,7 @@ def test_a_ball_has_its_area_and_radius_in_the_picture():
 def test_surfaces_are_lit_alike_from_wherever_one_looks():
     """A plate across the line of sight shows its colour times the light that falls on it."""
     corners = np.array([(-0.4, -0.4, 0.0), (0.4, -0.4, 0.0), (0.4, 0.4, 0.0), (-0.4, 0.4, 0.0)])
-    plate = Mesh(corners, np.array([(0, 1, 2), (0, 2, 3)]), np.full((4, 3), 0.5))
+    plate = Mesh(corners, np.array([(0, 1, 2), (0, 2, 3)]), np.full((2, 3, 3), 0.5))
     light = 0.50 / math.sqrt(0.35**2 + 0.80**2 + 0.50**2)
     for azimuth in (0.0, 50.0):
         cameras = orbit(1, 0.0, DISTANCE, ANGLE, width=32, height=32, azimuth=azimuth)
@@ -101,7 +101,7 @@ def test_mesh_files_are_read_with_their_colours(tmp_path):
     trimesh = pytest.importorskip("trimesh")
     mesh = ball(colour=(0.2, 0.6, 1.0))
     path = tmp_path / "ball.ply"
-    options = {"vertex_colors": mesh.colours, "process": False}
+    options = {"vertex_colors": np.tile((0.2, 0.6, 1.0), (len(mesh.vertices), 1)), "process": False}
     trimesh.Trimesh(mesh.vertices, mesh.faces, **options).export(path)
     read = load_mesh(path)
     assert read.faces.shape == mesh.faces.shape

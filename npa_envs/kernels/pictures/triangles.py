@@ -24,7 +24,7 @@ def draw_triangles(
     height: int,
     positions: wp.array2d[wp.vec2d],
     nearness: wp.array2d[wp.float64],
-    colours: wp.array[wp.vec3d],
+    colours: wp.array2d[wp.vec3d],
     faces: wp.array[wp.vec3i],
     visible: wp.array2d[wp.uint8],
     # outputs
@@ -68,9 +68,7 @@ def draw_triangles(
                     if near > nearest[camera, pixel]:
                         nearest[camera, pixel] = near
                         colour = (
-                            u * colours[corners[0]]
-                            + v * colours[corners[1]]
-                            + w * colours[corners[2]]
+                            u * colours[face, 0] + v * colours[face, 1] + w * colours[face, 2]
                         ) / near
                         picture[camera, pixel] = wp.vec4d(
                             colour[0], colour[1], colour[2], wp.float64(1.0)

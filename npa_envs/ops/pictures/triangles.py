@@ -23,8 +23,8 @@ def nearest_triangles(
 
     A pixel has the colour of the nearest triangle over its centre, and 1; without one it is 0. Q
     corners have `positions` in the pictures of V cameras [pixels], [V, Q, 2], `nearness` 1 / depth
-    [1 / length units], [V, Q], and `colours`, [Q, 3]. `faces`, [F, 3], are the corners of
-    triangles, and `visible`, [V, F], says which cameras see them.
+    [1 / length units], [V, Q]. `faces`, [F, 3], are the corners of triangles, `colours`, [F, 3, 3],
+    what they have there, and `visible`, [V, F], says which cameras see them.
     """
     count = len(positions)
     nearest = positions.new_zeros(count, height * width)

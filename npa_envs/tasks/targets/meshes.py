@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import torch
@@ -28,23 +29,47 @@ MESH_SUFFIXES = (".glb", ".gltf", ".obj", ".off", ".ply", ".stl")
 """Suffixes of mesh files."""
 
 
+Wrap = Literal["repeat", "mirror", "clamp"]
+"""What a texture shows beyond its edges: itself again, itself mirrored, or its edge."""
+
+
+@dataclass(frozen=True, eq=False)
+class Texture:
+    """A picture that lies on triangles."""
+
+    pixels: NDArray[np.uint8]
+    """Red, green and blue, sRGB, in [0, 255], shape [H, W, 3]; the first row is the upper one."""
+    wrap: tuple[Wrap, Wrap] = ("repeat", "repeat")
+    """What it shows beyond its left and right edges (u), and beyond upper and lower ones (v)."""
+
+
 @dataclass(frozen=True, eq=False)
 class Mesh:
-    """Triangles with colours at their vertices; y is up."""
+    """Triangles with colours or textures; y is up."""
 
     vertices: FloatArray
     """Vertices [length units], shape [K, 3]."""
     faces: NDArray[np.int64]
     """Vertex indices of each triangle, counterclockwise from outside, shape [F, 3]."""
     colours: FloatArray
-    """Red, green and blue of each vertex, in [0, 1], shape [K, 3]."""
+    """Red, green and blue at each corner of each triangle, sRGB, in [0, 1], shape [F, 3, 3]. On a
+    triangle with a texture they multiply the texture in linear light: white leaves it as it is."""
+    uv: FloatArray | None = None
+    """Place in the texture of each corner of each triangle, shape [F, 3, 2]: (0, 0) is the upper
+    left corner of the picture, and (1, 1) the lower right one. None: no triangle has a texture."""
+    texture_of_face: NDArray[np.int64] | None = None
+    """Index of each triangle's texture, -1 for none, shape [F]. None: none has one."""
+    textures: tuple[Texture, ...] = ()
+    """The textures."""
+    summary: str = ""
+    """What was read, in one line."""
 
     def fitted(self, radius: float = RADIUS) -> Mesh:
         """Return the mesh with its bounding box centred at 0, scaled into a ball of `radius`."""
         used = self.vertices[np.unique(self.faces)]
         middle = 0.5 * (used.min(axis=0) + used.max(axis=0))
         farthest = np.linalg.norm(used - middle, axis=1).max()
-        return Mesh((self.vertices - middle) * (radius / farthest), self.faces, self.colours)
+        return replace(self, vertices=(self.vertices - middle) * (radius / farthest))
 
     def normals(self) -> FloatArray:
         """Return unit normals at vertices, means over triangles weighted by area, shape [K, 3]."""
@@ -71,7 +96,8 @@ def load_mesh(source: str | Path) -> Mesh:
     """Return a built-in mesh, by name, or the mesh in a file, scaled into a ball of radius 0.85."""
     if isinstance(source, str) and source in MESHES:
         with np.load(MESHES[source]) as file:
-            return Mesh(file["vertices"], file["faces"].astype(np.int64), file["colours"]).fitted()
+            faces = file["faces"].astype(np.int64)
+            return Mesh(file["vertices"], faces, file["colours"][faces]).fitted()
     path = home_path(source)
     if path.suffix.lower() not in MESH_SUFFIXES:
         raise NPAError(
@@ -107,7 +133,7 @@ def _read_mesh(path: Path) -> Mesh:
     _check_triangles(vertices, faces, path)
     if colours.shape != vertices.shape or not np.isfinite(colours).all():
         colours = np.full(vertices.shape, 0.6)
-    return Mesh(vertices, faces, colours)
+    return Mesh(vertices, faces, colours[faces])
 
 
 def _check_triangles(vertices: FloatArray, faces: NDArray[np.int64], path: Path) -> None:
@@ -165,7 +191,7 @@ def draw_mesh(mesh: Mesh, cameras: Cameras) -> NDArray[np.float32]:
     # Copies: torch accepts no arrays with negative strides or read-only ones.
     colours, vertices = (
         torch.from_numpy(np.array(values, dtype=np.float64, order="C"))
-        for values in (mesh.colours * lit[:, None], mesh.vertices)
+        for values in (mesh.colours * lit[mesh.faces][..., None], mesh.vertices)
     )
     faces = torch.from_numpy(np.array(mesh.faces, dtype=np.int64, order="C"))
     motions = cameras.world_to_camera.double().cpu()
