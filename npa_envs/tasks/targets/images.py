@@ -20,7 +20,9 @@ from npa_envs.errors import NPAError, shown
 OPAQUE = 128
 """Minimum alpha of a pixel that belongs to a target, out of 255."""
 
-_BACKGROUND_TOLERANCE = 28  # of 255, in each of red, green and blue
+BACKGROUND_TOLERANCE = 28
+"""How far a background's red, green and blue may be from its colour, out of 255."""
+
 _UNIFORM = 0.95  # of the border's pixels
 _MAX_CUT_OUT = 2048  # pixels on each side
 _MAX_FILE = 256 * 2**20  # bytes
@@ -149,26 +151,31 @@ def cut_out_background(image: Image.Image, *, label: str) -> Image.Image:
     rgb = np.asarray(image.convert("RGB")).astype(np.float32)
     border = np.concatenate([rgb[0], rgb[-1], rgb[:, 0], rgb[:, -1]])
     background = np.median(border, axis=0)
-    uniform = (np.abs(border - background).max(axis=-1) <= _BACKGROUND_TOLERANCE).mean()
+    uniform = (np.abs(border - background).max(axis=-1) <= BACKGROUND_TOLERANCE).mean()
     if uniform < _UNIFORM:
         raise NPAError(
             f"target {shown(label)} has no transparency, so at least {_UNIFORM:.0%} of its "
             f"border must have one colour (the background), but only {uniform:.0%} have: give a "
             "PNG or WebP with a transparent background, or grow the whole picture (keep_background)"
         )
-    similar = np.abs(rgb - background).max(axis=-1) <= _BACKGROUND_TOLERANCE
-    outside = _connected_to_border(similar)
-    if outside.all():
+    cut = cut_out(image, background)
+    if cut.getextrema()[3] == (0, 0):
         raise NPAError(
             f"target {shown(label)} has no transparency and one colour all over, nothing to grow: "
             "give a picture with an object, best a PNG with a transparent background, or grow the "
             "whole picture (keep_background)"
         )
-    colour, alpha = _unmix_edge(rgb, ~outside, background)
-    pixels = np.concatenate([colour, 255 * alpha[..., None]], axis=-1)
-    cut = Image.fromarray(pixels.round().clip(0, 255).astype(np.uint8), "RGBA")
     require_opaque_pixels(cut, label=label)
     return cut
+
+
+def cut_out(image: Image.Image, background: FloatImage) -> Image.Image:
+    """Return a picture with the `background`, a colour [3], made transparent next to its border."""
+    rgb = np.asarray(image.convert("RGB")).astype(np.float32)
+    similar = np.abs(rgb - background).max(axis=-1) <= BACKGROUND_TOLERANCE
+    colour, alpha = _unmix_edge(rgb, ~_connected_to_border(similar), background)
+    pixels = np.concatenate([colour, 255 * alpha[..., None]], axis=-1)
+    return Image.fromarray(pixels.round().clip(0, 255).astype(np.uint8), "RGBA")
 
 
 def resample(image: Image.Image, point_count: int, *, label: str = "picture") -> Image.Image:
