@@ -12,6 +12,7 @@ from npa_envs.errors import MissingDependencyError, NPAError
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2D, Morphogenesis2DConfig
 from npa_envs.tasks.targets import images, picture_points
 from npa_envs.tasks.targets.images import read_image, resample
+from npa_envs.tasks.targets.notes import left_out
 from npa_envs.tasks.targets.picture_points import builtin_targets, load_target, target_from_image
 
 RED, GREEN, BLUE = (255, 0, 0), (0, 160, 0), (0, 0, 255)
@@ -263,3 +264,13 @@ def test_joined_emoji_is_one_picture_and_two_emoji_are_a_clear_error():
     assert len(load_target("👩‍🚀", point_count=1000).points) > 900
     with pytest.raises(NPAError, match="must be one emoji"):
         load_target("🦎🦎")
+
+
+def test_what_was_left_out_of_a_file_is_told_once(caplog):
+    left_out.cache_clear()
+    for text in ("2 more pages", "2 more pages", "its mask"):
+        left_out("scan.tif", text)
+    assert caplog.messages == [
+        "scan.tif: left out: 2 more pages",
+        "scan.tif: left out: its mask",
+    ]

@@ -58,6 +58,8 @@ class PointClouds:
     """Classes, int64, shape [M]."""
     coverage: float
     """Fraction of the unit square that has ink, averaged over the clouds."""
+    summary: str = ""
+    """What was read, in one line; empty for a built-in target."""
 
 
 @functools.lru_cache(CACHED_DATA_SETS)

@@ -40,6 +40,8 @@ class PointTarget:
     """Red, green and blue of each point in [0, 1] (dimensionless), shape [M, 3], float32."""
     pixel_size: float
     """Distance h between neighbouring points [length units]."""
+    summary: str = ""
+    """What was read, in one line; empty for a built-in target."""
 
     @property
     def mean_colour(self) -> Tensor:

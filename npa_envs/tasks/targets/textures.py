@@ -50,6 +50,8 @@ class TextureTarget:
     [R, R, 4], float32; the first row is the bottom."""
     tiles: bool
     """Whether opposite edges fit together."""
+    summary: str = ""
+    """What was read, in one line; empty for a built-in target."""
 
     @property
     def coverage(self) -> float:

@@ -54,10 +54,13 @@ class ViewTarget:
     """The views that the loss compares."""
     held_out: Views
     """The views that metrics compare."""
+    summary: str = ""
+    """What was read, in one line; empty for a built-in target."""
 
     def to(self, device: str | torch.device) -> ViewTarget:
         """Return a copy on another device."""
-        return ViewTarget(self.name, self.training.to(device), self.held_out.to(device))
+        training, held_out = self.training.to(device), self.held_out.to(device)
+        return replace(self, training=training, held_out=held_out)
 
 
 def load_views(
