@@ -59,8 +59,12 @@ def with_background(image: Image.Image) -> Image.Image:
 
 def open_image(path: Path) -> Image.Image:
     """Read a picture as RGBA, as it is."""
-    name = shown(str(path))
-    content = read_bytes(path, limit=_MAX_FILE, what="target")
+    return decode_image(read_bytes(path, limit=_MAX_FILE, what="target"), label=str(path))
+
+
+def decode_image(content: bytes, *, label: str) -> Image.Image:
+    """Return the picture in the bytes of a file as RGBA, as it is; errors call it `label`."""
+    name = shown(label)
     if not content:
         raise NPAError(f"target {name} is an empty file (0 bytes): save the picture again")
     try:

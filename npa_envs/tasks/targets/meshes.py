@@ -83,7 +83,7 @@ class Mesh:
         return unit
 
 
-MESHES = {path.stem: path for path in (Path(__file__).parent / "mesh_files").glob("*.npz")}
+MESHES = {path.stem: path for path in (Path(__file__).parent / "built_in_meshes").glob("*.npz")}
 """The files of the built-in meshes by name; `benchmarks/mesh_shapes.py` makes them."""
 
 
