@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from npa_envs.atomic_files import home_path
 from npa_envs.errors import NPAError, shown, suggest
 from npa_envs.ops import Cameras
-from npa_envs.ops.pictures.triangles import nearest_triangles
+from npa_envs.ops.pictures.triangles import WRAP_NUMBERS, TexturedFaces, nearest_triangles
 
 FloatArray = NDArray[np.float64]
 
@@ -119,23 +119,106 @@ AMBIENT = 0.6
 SAMPLES = 2
 """Number of samples along each side of a pixel."""
 
+MAX_TEXELS, MAX_ALL_TEXELS = 2**24, 2**26
+"""Maximum number of pixels of a texture, 4096 x 4096, and of all textures of a mesh together: those
+with more are halved."""
+
 BATCH_LIMIT = 2**22
 """Maximum number of samples, and of vertices, of the views that are drawn in one batch; a single
 view may have more."""
 
 
+def linear_light(colours: FloatArray) -> FloatArray:
+    """Return the linear brightness of sRGB values in [0, 1]."""
+    bright: FloatArray = ((colours + 0.055).clip(0.0) / 1.055) ** 2.4
+    return np.where(colours <= 0.04045, colours / 12.92, bright)
+
+
+def srgb_values(brightness: NDArray[Any]) -> NDArray[Any]:
+    """Return the sRGB values in [0, 1] of linear brightnesses."""
+    bright = 1.055 * brightness.clip(0.0) ** (1.0 / 2.4) - 0.055
+    return np.where(brightness <= 0.0031308, 12.92 * brightness, bright)
+
+
+def halved(pixels: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Return an sRGB picture [H, W, 3] at half its size, averaged in linear light."""
+    channels = []
+    for k in range(3):
+        channel = _BRIGHTNESS.astype(np.float32)[pixels[..., k]]
+        half = _halved_rows(_halved_rows(channel).T).T
+        channels.append((255.0 * srgb_values(half)).round().clip(0, 255).astype(np.uint8))
+    return np.stack(channels, axis=-1)
+
+
+def _halved_rows(values: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return half as many rows, rounded down, each the mean over an equal part of the height."""
+    count, half = len(values), len(values) // 2
+    if count == 1:
+        return values
+    upper, lower = values[: 2 * half : 2], values[1 : 2 * half : 2]
+    if count == 2 * half:
+        return 0.5 * (upper + lower)
+    share = np.arange(1, half + 1, dtype=np.float32)[:, None] / np.float32(count)
+    mean: NDArray[np.float32] = upper * (half / count + 1.0 / count - share)
+    mean += lower * (half / count)
+    mean += values[2::2] * share
+    return mean
+
+
+_BRIGHTNESS = linear_light(np.arange(256) / 255.0)
+
+
+def _textured_faces(mesh: Mesh, light: FloatArray) -> TexturedFaces | None:
+    """Return a mesh's textures with all their levels; `light`: brightness of each corner."""
+    if mesh.texture_of_face is None or mesh.uv is None or (mesh.texture_of_face < 0).all():
+        return None
+    texels, headers, total = [], [], 0
+    for texture in mesh.textures:
+        pixels = texture.pixels
+        while pixels[..., 0].size > min(MAX_TEXELS, MAX_ALL_TEXELS // len(mesh.textures)):
+            pixels = halved(pixels)
+        header = []
+        while True:
+            header.append((total, pixels.shape[1], pixels.shape[0]))
+            texels.append(pixels.reshape(-1, 3))
+            total += len(texels[-1])
+            if pixels.shape[:2] == (1, 1):
+                break
+            pixels = halved(pixels)
+        headers.append(header)
+    depth = max(map(len, headers))
+    levels = [header + [(0, 0, 0)] * (depth - len(header)) for header in headers]
+    wrap = [[WRAP_NUMBERS[side] for side in texture.wrap] for texture in mesh.textures]
+    return TexturedFaces(
+        torch.from_numpy(np.concatenate(texels)),
+        torch.tensor(levels, dtype=torch.int32),
+        torch.tensor(wrap, dtype=torch.int32),
+        torch.from_numpy(_BRIGHTNESS),
+        torch.from_numpy(mesh.texture_of_face.astype(np.int32)),
+        torch.from_numpy(np.nan_to_num(mesh.uv).astype(np.float64, order="C").clip(-1e9, 1e9)),
+        torch.from_numpy(light),
+    )
+
+
 def draw_mesh(mesh: Mesh, cameras: Cameras) -> NDArray[np.float32]:
     """Return pictures of a mesh by V cameras, [V, H, W, 4]: colours times alpha, alpha, in [0, 1].
 
-    Surfaces are matt and lit from a direction fixed in the world. Both sides of triangles are
-    visible. Triangles with a vertex nearer than `cameras.near` are left out. The top row is first.
+    Surfaces are matt and lit from a direction fixed in the world. Textures finer than pixels are
+    averaged in linear light. Both sides of triangles are visible. Triangles with a vertex nearer
+    than `cameras.near` are left out. The top row is first.
     """
     light = np.asarray(LIGHT) / np.linalg.norm(LIGHT)
     lit = AMBIENT + (1.0 - AMBIENT) * (mesh.normals() @ light).clip(0.0, 1.0)
+    light = lit[mesh.faces]
+    colours_of_corners = mesh.colours * light[..., None]
+    textures = _textured_faces(mesh, light)
+    if textures is not None:
+        textured = textures.of_face.numpy() >= 0
+        colours_of_corners[textured] = linear_light(mesh.colours[textured])
     # Copies: torch accepts no arrays with negative strides or read-only ones.
     colours, vertices = (
         torch.from_numpy(np.array(values, dtype=np.float64, order="C"))
-        for values in (mesh.colours * lit[mesh.faces][..., None], mesh.vertices)
+        for values in (colours_of_corners, mesh.vertices)
     )
     faces = torch.from_numpy(np.array(mesh.faces, dtype=np.int64, order="C"))
     motions = cameras.world_to_camera.double().cpu()
@@ -153,6 +236,7 @@ def draw_mesh(mesh: Mesh, cameras: Cameras) -> NDArray[np.float32]:
             colours,
             faces,
             (local[..., 2] >= cameras.near)[:, faces].all(dim=-1),
+            textures,
             width=width,
             height=height,
         )
