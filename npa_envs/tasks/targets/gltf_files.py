@@ -27,7 +27,7 @@ from npa_envs.tasks.targets.mesh_parts import (
     Part,
     strip,
 )
-from npa_envs.tasks.targets.meshes import FloatArray, Wrap
+from npa_envs.tasks.targets.meshes import FloatArray, Wrap, srgb_values
 
 _READ = (
     "EXT_mesh_gpu_instancing",
@@ -399,8 +399,7 @@ class _Gltf:
         elif index is None:
             # White, as glTF says, but not without a word.
             linear = np.full_like(linear, np.nan)
-        curved = 1.055 * linear.clip(0.0031308, 1.0) ** (1.0 / 2.4) - 0.055
-        colours = np.where(linear <= 0.0031308, 12.92 * linear.clip(0.0), curved)
+        colours = srgb_values(linear.clip(0.0, 1.0))
         part = Part(points, faces, colours[faces])
         if texture is not None and uv is not None:
             part.uv, part.texture = uv[faces], texture.texture

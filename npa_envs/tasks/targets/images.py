@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import contextlib
 import io
 import math
 import os
 import warnings
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import EpsImagePlugin, Image, UnidentifiedImageError, features
+from PIL import Image, UnidentifiedImageError, features
 
 from npa_envs.atomic_files import read_bytes
 from npa_envs.errors import MissingDependencyError, NPAError, importing, shown
@@ -105,7 +103,7 @@ def decode_image(content: bytes, *, label: str) -> Image.Image:
                 opened.load()
                 # A format inside of another may have another size.
                 _check_area(opened.size, name)
-                return to_rgba(opened, content, str(path))
+                return to_rgba(opened, content, label)
     except Image.DecompressionBombError as error:
         raise _too_large(name, "more") from error
     except UnidentifiedImageError as error:
@@ -148,17 +146,6 @@ def _formats(content: bytes, name: str) -> tuple[str, ...]:
         import pillow_heif
     pillow_heif.register_heif_opener()
     return (*FORMATS, "HEIF")
-
-
-@contextlib.contextmanager
-def no_foreign_programs() -> Iterator[None]:
-    """Return a context in which Pillow runs no Ghostscript, whichever library calls Pillow."""
-    before = EpsImagePlugin.gs_binary
-    EpsImagePlugin.gs_binary = False
-    try:
-        yield
-    finally:
-        EpsImagePlugin.gs_binary = before
 
 
 def _check_area(size: tuple[int, int], name: str) -> None:
