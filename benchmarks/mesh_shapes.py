@@ -1,6 +1,6 @@
 """Coloured meshes made by formulas: the built-in ones of the package, and parts for others.
 
-`python benchmarks/mesh_shapes.py npa_envs/tasks/targets/mesh_files` writes the built-in files.
+`python benchmarks/mesh_shapes.py npa_envs/tasks/targets/built_in_meshes` writes the built-in files.
 """
 
 from __future__ import annotations

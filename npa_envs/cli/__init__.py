@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import importlib
 import io
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 from npa_envs.errors import NPAError, suggest
 
@@ -71,7 +72,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if isinstance(stream, io.TextIOWrapper) and stream.encoding.lower() != "utf-8":
             stream.reconfigure(errors="replace")
     try:
-        return _dispatch(words)
+        with _printed_targets():
+            return _dispatch(words)
     except NPAError as error:
         print(f"npa-envs: error: {' '.join(str(error).split())}", file=sys.stderr)
         return ERROR
@@ -88,6 +90,33 @@ def main(arguments: Sequence[str] | None = None) -> int:
         hint = HINTS.get(error.errno or 0, "")
         print(f"npa-envs: error: {error.strerror or error}{where}{hint}", file=sys.stderr)
         return ERROR
+
+
+@contextlib.contextmanager
+def _printed_targets() -> Iterator[None]:
+    """Within the block, print each line about a target's file once."""
+    import logging
+
+    printed: set[str] = set()
+
+    def show(record: logging.LogRecord) -> bool:
+        line = record.getMessage()
+        if line not in printed:
+            printed.add(line)
+            stream = sys.stderr if record.levelno > logging.INFO else sys.stdout
+            print(line, file=stream, flush=True)
+        return False
+
+    logger, handler = logging.getLogger("npa_envs.targets"), logging.Handler()
+    handler.addFilter(show)
+    before = logger.level
+    logger.addHandler(handler)
+    logger.setLevel(logging.INFO)
+    try:
+        yield
+    finally:
+        logger.removeHandler(handler)
+        logger.setLevel(before)
 
 
 def _dispatch(arguments: Sequence[str]) -> int:

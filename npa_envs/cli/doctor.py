@@ -12,7 +12,18 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
-EXTRAS = ("envs", "sb3", "human", "view", "bench", "evolution", "points", "meshes", "minari")
+EXTRAS = (
+    "envs",
+    "sb3",
+    "human",
+    "view",
+    "bench",
+    "evolution",
+    "points",
+    "meshes",
+    "heic",
+    "minari",
+)
 """The extras of `all`."""
 
 

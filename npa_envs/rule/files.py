@@ -144,7 +144,7 @@ def save_rule(
         raise NPAError(
             f"rule must have the network of NPARule, got a {type(rule).__name__} with another "
             "one, which the file would not contain: remove its hooks, or keep its state_dict "
-            "with torch.save"
+            "with torch.save, for load_state_dict of the same class"
         )
     path = checked_path(path)
     if path.suffix != ".safetensors":

@@ -107,6 +107,12 @@ def read_state_dict(data: bytes) -> RuleParts:
         known, rule_type, more = _EQUIVARIANT_NAMES, " of an equivariant rule", ""
     decoder = _DECODER_NAMES & known.keys()
     required = {*known, "eps0", "alpha"} - decoder
+    if {"hidden.weight", "output.weight"} <= state.keys():
+        raise NPAError(
+            "this is the state dict of an NPARule, which lacks hyper-parameters such as eps0: save "
+            "the rule with npa_envs.save_rule(rule, 'rule.safetensors'); if there is only this "
+            "file, give a new NPARule with the same hyper-parameters its load_state_dict first"
+        )
     missing = required - state.keys()
     missing |= decoder - state.keys() if state.keys() & decoder else set()
     unknown = state.keys() - required - decoder - _IGNORED
@@ -321,8 +327,9 @@ def _unpickle(data: bytes) -> Mapping[Any, Any]:
     except pickle.UnpicklingError as error:
         doubt = "" if is_zip else "is no state dict, is damaged, or "
         raise NPAError(
-            f"the file {doubt}holds objects other than tensors, which could run code: export a "
-            "plain state dict with torch.save(model.state_dict(), path)"
+            f"the file {doubt}holds objects other than tensors, which could run code: "
+            "export a model of the authors with torch.save(model.state_dict(), path), and save a "
+            "rule of this package with npa_envs.save_rule"
         ) from error
     except Exception as error:
         # Torch raises exceptions of many kinds for damaged data.

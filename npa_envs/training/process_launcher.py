@@ -107,7 +107,12 @@ def requested_processes(gpus: int | None, processes: int | None, device: str) ->
 
 @contextlib.contextmanager
 def print_once(processes: ProcessGroup) -> Iterator[None]:
-    """Within the block, let only rank 0 raise NPAErrors; other processes exit with code 2."""
+    """Within the block, let only rank 0 raise NPAErrors and tell of targets' files.
+
+    Other processes exit with code 2 after an NPAError.
+    """
+    if not processes.first:
+        logging.getLogger("npa_envs.targets").setLevel(logging.CRITICAL)
     try:
         yield
     except NPAError as error:

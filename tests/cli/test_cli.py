@@ -22,6 +22,7 @@ from npa_envs.errors import NPAError
 from npa_envs.render.world_film import WorldFilm
 from npa_envs.rule.files import load_rule, save_rule
 from npa_envs.rule.rule import NPARule
+from npa_envs.tasks.targets.notes import left_out
 from npa_envs.training import TASKS, preset
 from npa_envs.world.particles import Particles
 
@@ -383,6 +384,25 @@ def test_rollout_writes_films_that_open(tmp_path, rule, capsys):
         assert strip.width == 7 * (256 + 8) + 8
     for name in ("growth.gif", "growth.mp4", "growth-filmstrip.png"):
         assert f"wrote {out / name}" in text
+
+
+def test_commands_say_once_what_was_read_of_a_target_and_what_was_not(tmp_path, rule, capsys):
+    left_out.cache_clear()
+    frames = [Image.new("RGBA", (40, 40)) for _ in range(2)]
+    for frame in frames:
+        frame.paste((200, 30, 30, 255), (10, 10, 30, 30))
+    frames[1].putpixel((0, 0), (0, 0, 0, 255))
+    path = tmp_path / "red.png"
+    frames[0].save(path, save_all=True, append_images=frames[1:])
+    for words in (["rollout", rule, "--steps", "2", "--out", str(tmp_path)], ["evaluate", rule]):
+        options = ["--seed-count", "1", "--checkpoints", "2"] if words[0] == "evaluate" else []
+        assert main([*words, *options, "--target", str(path), "--no-progress"]) == 0
+        said = capsys.readouterr()
+        assert said.out.startswith("red.png: 40 x 40, cut out by alpha, 25 % of its pixels\n")
+        assert said.out.count("red.png") == 1
+        told = f"{path}: left out: all its frames, pages or pictures but the first\n"
+        # The second command runs in the same process.
+        assert said.err == (told if words[0] == "rollout" else "")
 
 
 def test_rollout_repeats_itself_and_makes_about_150_frames(tmp_path, rule):

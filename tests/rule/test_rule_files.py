@@ -268,6 +268,12 @@ def test_code_in_a_state_dict_is_not_run(tmp_path, is_zip, message):
     assert not (tmp_path / "ran").exists()
 
 
+def test_rules_saved_by_torch_are_refused_with_what_saves_them(tmp_path):
+    for saved in (NPARule(), NPARule().state_dict()):
+        torch.save(saved, tmp_path / "b.pth")
+        refused(r"save.*rule.*npa_envs\.save_rule", load_rule, tmp_path / "b.pth")
+
+
 def test_a_changed_byte_in_a_state_dict_is_noticed_and_the_legacy_format_is_read(tmp_path):
     rule = NPARule()
     path = tmp_path / "npa.pth"

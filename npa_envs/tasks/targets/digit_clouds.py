@@ -18,6 +18,7 @@ from torch import Tensor
 
 from npa_envs.atomic_files import home_path, open_regular
 from npa_envs.errors import MissingDependencyError, NPAError, shown, suggest
+from npa_envs.tasks.targets.notes import tell
 from npa_envs.world.randomness import Randomness, normal_draws, uniform_draws
 
 Split = Literal["train", "test"]
@@ -80,7 +81,12 @@ def load_clouds(
     x, area = sample_ink(ink, particle_count, sample_seed=sample_seed, device=device)
     height, width = ink.shape[1:]
     coverage = area * (height * width / max(height, width) ** 2)
-    return PointClouds(x, torch.from_numpy(label).to(device), coverage)
+    summary = ""
+    if data != "digits":
+        summary = f"{shown(data)[1:-1]}: {len(ink)} pictures of {width} x {height} to {split}, "
+        summary += f"{len(np.unique(label))} classes"
+        tell(summary)
+    return PointClouds(x, torch.from_numpy(label).to(device), coverage, summary)
 
 
 def sample_ink(

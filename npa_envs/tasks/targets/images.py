@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-import contextlib
 import io
 import math
 import os
 import warnings
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import EpsImagePlugin, Image, ImageOps, UnidentifiedImageError
+from PIL import Image, UnidentifiedImageError, features
 
 from npa_envs.atomic_files import read_bytes
-from npa_envs.errors import NPAError, shown
+from npa_envs.errors import MissingDependencyError, NPAError, importing, shown
+from npa_envs.tasks.targets.picture_modes import Mask, kind_of_tiff, to_rgba
 
 OPAQUE = 128
 """Minimum alpha of a pixel that belongs to a target, out of 255."""
@@ -32,7 +31,11 @@ MAX_AREA = 2**26
 """Maximum number of pixels of a picture: 8192 x 8192."""
 
 FORMATS = ("PNG", "JPEG", "BMP", "GIF", "PPM", "TIFF", "WEBP")
-"""Pillow's names of the allowed formats. Others may start other programs, as EPS does."""
+"""Pillow's names of the formats allowed everywhere. Others may start other programs, as EPS does.
+AVIF is allowed where Pillow has it, HEIC where pillow-heif is installed."""
+
+TRANSPARENT_SHARE = 0.001
+"""A picture is cut out by alpha if a larger share of its pixels have an alpha below one half."""
 
 MAX_GRID_SIDE = 6144
 """Maximum side of the square grid to which a picture is scaled [pixels]."""
@@ -41,16 +44,41 @@ MAX_POINT_COUNT = 2**24
 """Maximum number of points of a target."""
 
 FloatImage = NDArray[np.float32]
-Mask = NDArray[np.bool_]
 
 
-def read_image(path: Path) -> Image.Image:
-    """Read a picture as RGBA; the background of one without transparency is made transparent."""
-    image = open_image(path)
-    if np.asarray(image.getchannel("A")).min() == 255:
-        return cut_out_background(image, label=str(path))
+def read_image(path: Path, *, keep_background: bool = False) -> tuple[Image.Image, str]:
+    """Read a picture as RGBA, and return it with a line about what was read.
+
+    The background of one without transparency is made transparent, unless it is kept.
+    """
+    opened = open_image(path)
+    if keep_background:
+        return opened, summary_of(path.name, opened, "its whole rectangle")
+    image, how = opened, "cut out by alpha"
+    if not is_cut_out(opened):
+        try:
+            image, how = cut_out_background(opened, label=str(path)), "cut out of its background"
+        except NPAError:
+            # A few transparent pixels are better than no target.
+            if not is_cut_out(opened, least=0.0):
+                raise
     require_opaque_pixels(image, label=str(path))
-    return image
+    return image, summary_of(path.name, opened, f"{how}, {opaque_share(image)} of its pixels")
+
+
+def summary_of(name: str, image: Image.Image, text: str) -> str:
+    """Return a line about a picture called `name`: its size, and what was used of it."""
+    return f"{shown(name)[1:-1]}: {image.width} x {image.height}, {text}"
+
+
+def opaque_share(image: Image.Image) -> str:
+    """Return the share of an RGBA picture's pixels that are opaque, such as "41 %"."""
+    return f"{100 * _opaque_count(image) / (image.width * image.height):.0f} %"
+
+
+def is_cut_out(image: Image.Image, *, least: float = TRANSPARENT_SHARE) -> bool:
+    """Return whether alpha cuts an RGBA picture out: more than this share is transparent."""
+    return bool((np.asarray(image.getchannel("A")) < OPAQUE).mean() > least)
 
 
 def with_background(image: Image.Image) -> Image.Image:
@@ -61,24 +89,33 @@ def with_background(image: Image.Image) -> Image.Image:
 
 def open_image(path: Path) -> Image.Image:
     """Read a picture as RGBA, as it is."""
-    name = shown(str(path))
-    content = read_bytes(path, limit=_MAX_FILE, what="target")
+    return decode_image(read_bytes(path, limit=_MAX_FILE, what="target"), label=str(path))
+
+
+def decode_image(content: bytes, *, label: str) -> Image.Image:
+    """Return the picture in the bytes of a file as RGBA, as it is; errors call it `label`."""
+    name = shown(label)
     if not content:
         raise NPAError(f"target {name} is an empty file (0 bytes): save the picture again")
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            with Image.open(io.BytesIO(content), formats=FORMATS) as opened:
+            with Image.open(io.BytesIO(content), formats=_formats(content, name)) as opened:
                 _check_area(opened.size, name)
                 opened.load()
                 # A format inside of another may have another size.
                 _check_area(opened.size, name)
-                return _to_rgba(ImageOps.exif_transpose(opened))
+                return to_rgba(opened, content, label)
     except Image.DecompressionBombError as error:
         raise _too_large(name, "more") from error
     except UnidentifiedImageError as error:
+        kind = kind_of_tiff(content)
+        if kind:
+            raise NPAError(
+                f"target {name} is a {kind}, which Pillow does not read: save it as PNG"
+            ) from error
         raise NPAError(
-            f"target {name} must be a picture ({', '.join(FORMATS)}), "
+            f"target {name} must be a picture ({', '.join(FORMATS)}, AVIF, HEIC), "
             "but its content is none of these: save it as PNG"
         ) from error
     except NPAError:
@@ -91,15 +128,26 @@ def open_image(path: Path) -> Image.Image:
         ) from error
 
 
-@contextlib.contextmanager
-def no_foreign_programs() -> Iterator[None]:
-    """Return a context in which Pillow runs no Ghostscript, whichever library calls Pillow."""
-    before = EpsImagePlugin.gs_binary
-    EpsImagePlugin.gs_binary = False
-    try:
-        yield
-    finally:
-        EpsImagePlugin.gs_binary = before
+def _formats(content: bytes, name: str) -> tuple[str, ...]:
+    """Return Pillow's names of the formats that a file may have.
+
+    Raise MissingDependencyError for AVIF or HEIC where what reads it is missing.
+    """
+    if content[4:8] != b"ftyp":
+        return FORMATS
+    brands = content[8 : int.from_bytes(content[:4], "big")]
+    if b"avif" in brands or b"avis" in brands:
+        if not features.check("avif"):
+            raise MissingDependencyError(
+                f"target {name} is an AVIF picture, which this Pillow does not read: "
+                "pip install --upgrade pillow, or save it as PNG"
+            )
+        return (*FORMATS, "AVIF")
+    hint = "pip install pillow-heif, or save it as PNG"
+    with importing("pillow-heif", f"target {name}, a HEIC picture,", hint):
+        import pillow_heif
+    pillow_heif.register_heif_opener()
+    return (*FORMATS, "HEIF")
 
 
 def _check_area(size: tuple[int, int], name: str) -> None:
@@ -141,7 +189,7 @@ def require_opaque_pixels(image: Image.Image, *, label: str) -> None:
 
 
 def cut_out_background(image: Image.Image, *, label: str) -> Image.Image:
-    """Return an opaque picture with its plain background made transparent.
+    """Return an opaque RGBA picture with its plain background made transparent.
 
     The background has the colour of the border and is connected with it; a hole that the object
     encloses stays opaque. The object's colour and alpha are estimated for pixels at its edge.
@@ -154,16 +202,17 @@ def cut_out_background(image: Image.Image, *, label: str) -> Image.Image:
     uniform = (np.abs(border - background).max(axis=-1) <= BACKGROUND_TOLERANCE).mean()
     if uniform < _UNIFORM:
         raise NPAError(
-            f"target {shown(label)} has no transparency, so at least {_UNIFORM:.0%} of its "
-            f"border must have one colour (the background), but only {uniform:.0%} have: give a "
-            "PNG or WebP with a transparent background, or grow the whole picture (keep_background)"
+            f"target {shown(label)} is opaque, so at least {_UNIFORM:.0%} of its border must have "
+            f"one colour (the background), but only {uniform:.0%} have, so there is no part to cut "
+            "out: --keep-background grows the whole rectangle (in Python keep_background=True), "
+            "or give a PNG or WebP with a transparent background"
         )
     cut = cut_out(image, background)
     if cut.getextrema()[3] == (0, 0):
         raise NPAError(
-            f"target {shown(label)} has no transparency and one colour all over, nothing to grow: "
-            "give a picture with an object, best a PNG with a transparent background, or grow the "
-            "whole picture (keep_background)"
+            f"target {shown(label)} is opaque and of one colour all over, nothing to grow: give a "
+            "picture with an object, best a PNG with a transparent background; --keep-background "
+            "grows the whole rectangle (in Python keep_background=True)"
         )
     require_opaque_pixels(cut, label=label)
     return cut
@@ -174,7 +223,8 @@ def cut_out(image: Image.Image, background: FloatImage) -> Image.Image:
     rgb = np.asarray(image.convert("RGB")).astype(np.float32)
     similar = np.abs(rgb - background).max(axis=-1) <= BACKGROUND_TOLERANCE
     colour, alpha = _unmix_edge(rgb, ~_connected_to_border(similar), background)
-    pixels = np.concatenate([colour, 255 * alpha[..., None]], axis=-1)
+    alpha = np.minimum(255 * alpha, np.asarray(image.getchannel("A")))
+    pixels = np.concatenate([colour, alpha[..., None]], axis=-1)
     return Image.fromarray(pixels.round().clip(0, 255).astype(np.uint8), "RGBA")
 
 
@@ -265,18 +315,6 @@ def _sample(padded: Image.Image, span: int, pitch: float) -> Image.Image:
 
 def _opaque_count(image: Image.Image) -> int:
     return int((np.asarray(image.getchannel("A")) >= OPAQUE).sum())
-
-
-def _to_rgba(image: Image.Image) -> Image.Image:
-    """Return a picture of any of Pillow's modes as RGBA, 16 bits and floats scaled to 8 bits."""
-    if image.mode.startswith("I") or image.mode == "F":
-        # Pillow would clip sixteen bits at 255 instead of scaling them.
-        levels = np.asarray(image).astype(np.float64)
-        top = 255.0 if levels.max() < 256 else 65535.0
-        if image.mode == "F" and levels.max() <= 1:
-            top = 1.0
-        image = Image.fromarray((levels / top * 255).clip(0, 255).astype(np.uint8))
-    return image.convert("RGBA")
 
 
 def _connected_to_border(similar: Mask) -> Mask:

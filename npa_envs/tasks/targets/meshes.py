@@ -10,20 +10,18 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from npa_envs.atomic_files import home_path, open_regular
-from npa_envs.errors import MissingDependencyError, NPAError, shown, suggest
+from npa_envs.atomic_files import home_path
+from npa_envs.errors import NPAError, shown, suggest
 from npa_envs.ops import Cameras
 from npa_envs.ops.pictures.triangles import WRAP_NUMBERS, TexturedFaces, nearest_triangles
-from npa_envs.tasks.targets.images import no_foreign_programs
 
 FloatArray = NDArray[np.float64]
 
 RADIUS = 0.85
 """Radius of the ball around the origin into which every mesh is scaled [length units]."""
 
-_MAX_FILE = 256 * 2**20
-_SIZE_RANGE = 1e-30, 1e30
-_MIN_AREA = 1e-12
+MAX_FILE = 256 * 2**20
+"""Maximum size of a mesh file, and of each file that it names [bytes]."""
 
 MESH_SUFFIXES = (".glb", ".gltf", ".obj", ".off", ".ply", ".stl")
 """Suffixes of mesh files."""
@@ -83,7 +81,7 @@ class Mesh:
         return unit
 
 
-MESHES = {path.stem: path for path in (Path(__file__).parent / "mesh_files").glob("*.npz")}
+MESHES = {path.stem: path for path in (Path(__file__).parent / "built_in_meshes").glob("*.npz")}
 """The files of the built-in meshes by name; `benchmarks/mesh_shapes.py` makes them."""
 
 
@@ -104,64 +102,10 @@ def load_mesh(source: str | Path) -> Mesh:
             f"target must be a built-in mesh, the path of a mesh file ({', '.join(MESH_SUFFIXES)}) "
             f"or a folder of views, got {shown(str(source))}: {suggest(source, MESHES)}"
         )
-    open_regular(path, limit=_MAX_FILE, what="target").close()
-    return _read_mesh(path).fitted()
+    # The readers make meshes.
+    from npa_envs.tasks.targets.mesh_files import read_mesh
 
-
-def _read_mesh(path: Path) -> Mesh:
-    """Return the mesh in a file, as large as there; grey where the file has no colours."""
-    try:
-        import trimesh
-    except ImportError as error:
-        raise MissingDependencyError(
-            f"reading the mesh {shown(str(path))} needs trimesh, which is not installed: "
-            "pip install 'npa-envs[meshes]', or take a built-in mesh"
-        ) from error
-    try:
-        with no_foreign_programs(), np.errstate(all="ignore"):
-            read = trimesh.load(path, force="mesh", process=False)
-            vertices = np.asarray(read.vertices, dtype=np.float64)
-            faces = np.asarray(read.faces, dtype=np.int64)
-            visual = read.visual.to_color() if hasattr(read.visual, "to_color") else read.visual
-            colours = np.asarray(visual.vertex_colors, dtype=np.float64)[:, :3] / 255.0
-    except Exception as error:
-        # Its readers report damaged files by exceptions of many kinds.
-        raise NPAError(
-            f"target {shown(str(path))} cannot be read as a mesh ({type(error).__name__}: "
-            f"{shown(error)}): save it again, for example as .ply or .glb"
-        ) from error
-    _check_triangles(vertices, faces, path)
-    if colours.shape != vertices.shape or not np.isfinite(colours).all():
-        colours = np.full(vertices.shape, 0.6)
-    return Mesh(vertices, faces, colours[faces])
-
-
-def _check_triangles(vertices: FloatArray, faces: NDArray[np.int64], path: Path) -> None:
-    """Raise NPAError unless a file's triangles exist, are finite, of a usual size, and not flat."""
-    in_space = vertices.shape[1:] == (3,) and faces.shape[1:] == (3,)
-    if not in_space or faces.size == 0 or vertices.size == 0 or not np.isfinite(vertices).all():
-        raise NPAError(
-            f"target {shown(str(path))} must hold triangles with finite corners, got {len(faces)} "
-            f"triangles and {len(vertices)} corners: give a surface, not a point cloud"
-        )
-    if faces.min() < 0 or faces.max() >= len(vertices):
-        raise NPAError(
-            f"the triangles of target {shown(str(path))} must have corners from 0 to "
-            f"{len(vertices) - 1}, got {faces.min()} to {faces.max()}: save it again"
-        )
-    used = vertices[np.unique(faces)]
-    size = float((used.max(axis=0) / 2 - used.min(axis=0) / 2).max()) * 2
-    if not _SIZE_RANGE[0] <= size <= _SIZE_RANGE[1] or np.abs(used).max() > _SIZE_RANGE[1]:
-        raise NPAError(
-            f"target {shown(str(path))} must lie within {_SIZE_RANGE[1]:g} of the origin and be of "
-            f"a size of at least {_SIZE_RANGE[0]:g}, got a size of {size:.3g}: scale it"
-        )
-    a, b, c = ((vertices[faces[:, k]] - used.min(axis=0)) / size for k in range(3))
-    if np.linalg.norm(np.cross(b - a, c - a), axis=1).max() < _MIN_AREA:
-        raise NPAError(
-            f"target {shown(str(path))} must have a surface, but the corners of every triangle "
-            "lie on a line: give triangles with an area"
-        )
+    return read_mesh(path).fitted()
 
 
 # Pictures of meshes.

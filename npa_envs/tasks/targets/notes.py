@@ -1,4 +1,4 @@
-"""What users are told about the file of a target that was not used whole."""
+"""What users are told about the file of a target: what was read of it, and what was not."""
 
 from __future__ import annotations
 
@@ -8,10 +8,17 @@ import logging
 logger = logging.getLogger("npa_envs.targets")
 
 
+def tell(line: str) -> None:
+    """Log a line about what was read as a target, unless it is empty; `npa-envs` prints it."""
+    if line:
+        logger.info("%s", line)
+
+
 @functools.lru_cache(1024)
-def left_out(name: str, text: str) -> None:
+def left_out(name: str, text: str, *, what: str = "left out") -> None:
     """Warn, once in a process, of what was not used of a file.
 
-    `name` is the file's name or path. `text` says what was left out, as in "its normals".
+    `name` is the file's name or path. `text` says what was left out, as in "its normals"; `what` is
+    the word before it.
     """
-    logger.warning("%s: left out: %s", name, text)
+    logger.warning("%s: %s: %s", name, what, text)

@@ -20,12 +20,13 @@ from npa_envs.tasks.targets.images import (
     MAX_POINT_COUNT,
     OPAQUE,
     looks_like_path,
-    open_image,
     read_image,
     require_opaque_pixels,
     resample,
+    summary_of,
     with_background,
 )
+from npa_envs.tasks.targets.notes import tell
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,14 +85,16 @@ def load_target(
             f"target must be a string or a Path, got {type(source).__name__}: "
             "for a Pillow picture in memory use target_from_image"
         )
+    summary = ""
     if isinstance(source, str) and source in builtin_targets():
         with Image.open(DRAWINGS / f"{source}.png") as drawing:
             name, image = source, drawing.convert("RGBA")
     elif isinstance(source, Path) or looks_like_path(source):
         path = home_path(source)
-        name, image = path.stem, (open_image if keep_background else read_image)(path)
+        name, (image, summary) = path.stem, read_image(path, keep_background=keep_background)
     elif is_emoji(source):
         name, image = source, render_emoji(source)
+        summary = summary_of(source, image, "drawn by an installed font")
     else:
         raise NPAError(
             "target must be a built-in name, the path of a picture file or one emoji, got "
@@ -99,7 +102,9 @@ def load_target(
         )
     if keep_background:
         image = with_background(image)
-    return target_from_image(image, name=name, point_count=point_count)
+    target = target_from_image(image, name=name, point_count=point_count)
+    tell(summary)
+    return replace(target, summary=summary)
 
 
 def target_from_image(image: Image.Image, *, name: str, point_count: int = 4096) -> PointTarget:

@@ -10,7 +10,7 @@ import functools
 import itertools
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -26,11 +26,15 @@ from npa_envs.atomic_files import home_path
 from npa_envs.checks import check_count
 from npa_envs.errors import NPAError, shown, suggest
 from npa_envs.tasks.targets.images import (
+    is_cut_out,
     looks_like_path,
+    opaque_share,
     open_image,
     require_opaque_pixels,
     scaled_square,
+    summary_of,
 )
+from npa_envs.tasks.targets.notes import tell
 
 Array = NDArray[np.floating[Any]]
 Pattern = Callable[[Array, Array, np.random.Generator], Array]
@@ -145,9 +149,14 @@ def load_texture(
             f"target {shown(str(path))} must have at least 2 x 2 pixels, got {image.width} x "
             f"{image.height}: give a larger picture"
         )
+    text = f"its middle square of {side} x {side}, " if image.width != image.height else ""
+    text += f"alpha covers {opaque_share(image)}" if is_cut_out(image) else "covered evenly"
+    summary = summary_of(path.name, image, text)
+    tell(summary)
     left, top = (image.width - side) // 2, (image.height - side) // 2
     square = image.crop((left, top, left + side, top + side))
-    return _texture_target(path.stem, scaled_square(square, resolution)[::-1], tiles)
+    target = _texture_target(path.stem, scaled_square(square, resolution)[::-1], tiles)
+    return replace(target, summary=summary)
 
 
 def _texture_target(name: str, picture: Array, tiles: bool) -> TextureTarget:

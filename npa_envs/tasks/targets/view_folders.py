@@ -23,9 +23,9 @@ from npa_envs.errors import NPAError, shown, suggest
 from npa_envs.ops import cameras_of_poses
 from npa_envs.tasks.targets.images import (
     BACKGROUND_TOLERANCE,
-    OPAQUE,
     FloatImage,
     cut_out,
+    is_cut_out,
     open_image,
     scaled_square,
 )
@@ -310,7 +310,7 @@ def _plain_background(folder: Path, frames: Sequence[Frame]) -> FloatImage | Non
     edges = []
     for frame in frames:
         image = open_image(frame.picture)
-        if (np.asarray(image.getchannel("A")) < OPAQUE).any():
+        if is_cut_out(image):
             return None
         rgb = np.asarray(image.convert("RGB"))
         edges.append(np.concatenate([rgb[0], rgb[-1], rgb[:, 0], rgb[:, -1]]))

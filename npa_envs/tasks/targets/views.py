@@ -108,7 +108,7 @@ def views_of_mesh(
     for count, turn in ((training_count, 0.0), (held_out_count, 0.5)):
         cameras = surrounding_cameras(count, resolution, turn=turn)
         views.append(Views(cameras, torch.from_numpy(draw_mesh(mesh, cameras))))
-    return ViewTarget(name, views[0], views[1])
+    return ViewTarget(name, views[0], views[1], mesh.summary)
 
 
 def surrounding_cameras(count: int, resolution: int, *, turn: float = 0.0) -> Cameras:
