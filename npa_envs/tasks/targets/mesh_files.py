@@ -243,7 +243,7 @@ def _read_rows(
     }, end
 
 
-def _ply_colours(file: MeshFile, element: dict[str, PlyProperty]) -> FloatArray | None:
+def ply_colours(file: MeshFile, element: dict[str, PlyProperty]) -> FloatArray | None:
     """Return the colours of the rows of an element, [n, 3], None if it has none."""
     for names in ("red green blue", "diffuse_red diffuse_green diffuse_blue", "r g b"):
         if all(name in element for name in names.split()):
@@ -263,9 +263,9 @@ def _read_ply_parts(file: MeshFile, content: bytes) -> list[Part]:
     indices = face[key] if key else nothing
     flat = indices.values.astype(np.int64)
     corners, owners = file.polygons(vertices, flat, indices.counts)
-    at_corners, of_rows = _ply_colours(file, vertex), _ply_colours(file, face)
+    at_corners, of_rows = ply_colours(file, vertex), ply_colours(file, face)
     if "material_index" in face and "material" in elements:
-        palette = _ply_colours(file, elements["material"])
+        palette = ply_colours(file, elements["material"])
         of_rows = palette if palette is None else palette[face["material_index"].values]
     colours = None
     if at_corners is not None and (of_rows is None or np.ptp(at_corners, axis=0).any()):

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import functools
 import math
 import os
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -15,6 +17,7 @@ from npa_envs.checks import check_count
 from npa_envs.errors import NPAError, shown
 from npa_envs.ops import Cameras, look_at, orbit
 from npa_envs.tasks.targets.meshes import Mesh, draw_mesh, load_mesh
+from npa_envs.tasks.targets.splat_files import draw_splats, ply_kind, read_splats
 
 DISTANCE = 3.2
 """Distance of cameras from the origin [length units]."""
@@ -67,14 +70,14 @@ def load_views(
     training_count: int = 48,
     held_out_count: int = 12,
 ) -> ViewTarget:
-    """Make a target from a built-in mesh, a mesh file or a folder of views.
+    """Make a target from a built-in mesh, a mesh file, a PLY file of points, or a folder of views.
 
-    A mesh is drawn from cameras all around. A folder is in the format of NeRF-synthetic,
-    instant-ngp or nerfstudio; of a single `transforms.json` every eighth view is held out. Evenly
-    spaced views are taken, at most `training_count` and `held_out_count`. Lenses are undistorted,
-    and pictures become squares. The scene is rotated so that y is up, and scaled into the ball of
-    radius 0.85. Opaque pictures lose the plain background around the thing. Views have
-    `resolution` pixels along each side.
+    Meshes, point clouds and trained Gaussians (3DGS) are drawn from cameras all around. A folder is
+    in the format of NeRF-synthetic, instant-ngp or nerfstudio; of a single `transforms.json` every
+    eighth view is held out. Evenly spaced views are taken, at most `training_count` and
+    `held_out_count`. Lenses are undistorted, and pictures become squares. The scene is rotated so
+    that y is up, and scaled into the ball of radius 0.85. Opaque pictures lose the plain background
+    around the thing. Views have `resolution` pixels along each side.
     """
     if not isinstance(source, str | Path) or not str(source):
         raise NPAError(
@@ -96,6 +99,11 @@ def load_views(
         from npa_envs.tasks.targets.view_folders import read_view_folder
 
         return read_view_folder(folder, resolution, training_count, held_out_count)
+    if folder.suffix.lower() == ".ply" and folder.is_file() and ply_kind(folder) != "triangles":
+        splats = read_splats(folder)
+        draw = functools.partial(draw_splats, splats)
+        counted = (training_count, held_out_count)
+        return _views_around(draw, folder.stem, resolution, counted, splats.summary)
     mesh = load_mesh(source)
     return views_of_mesh(mesh, folder.stem, resolution, training_count, held_out_count)
 
@@ -104,11 +112,27 @@ def views_of_mesh(
     mesh: Mesh, name: str, resolution: int, training_count: int, held_out_count: int
 ) -> ViewTarget:
     """Return views of a mesh, which fits into the ball of radius 0.85, from cameras all around."""
+    counts = (training_count, held_out_count)
+
+    def draw(cameras: Cameras) -> Tensor:
+        return torch.from_numpy(draw_mesh(mesh, cameras))
+
+    return _views_around(draw, name, resolution, counts, mesh.summary)
+
+
+def _views_around(
+    draw: Callable[[Cameras], Tensor],
+    name: str,
+    resolution: int,
+    counts: tuple[int, int],
+    summary: str,
+) -> ViewTarget:
+    """Return views that a function draws, to train with and held out, from cameras all around."""
     views = []
-    for count, turn in ((training_count, 0.0), (held_out_count, 0.5)):
+    for count, turn in zip(counts, (0.0, 0.5), strict=True):
         cameras = surrounding_cameras(count, resolution, turn=turn)
-        views.append(Views(cameras, torch.from_numpy(draw_mesh(mesh, cameras))))
-    return ViewTarget(name, views[0], views[1], mesh.summary)
+        views.append(Views(cameras, draw(cameras)))
+    return ViewTarget(name, views[0], views[1], summary)
 
 
 def surrounding_cameras(count: int, resolution: int, *, turn: float = 0.0) -> Cameras:
