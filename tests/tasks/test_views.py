@@ -315,7 +315,10 @@ DAMAGES = [
         edited(lambda f, c: c.update(camera_model="OPENCV_FISHEYE")),
         "frame 0 .* got .OPENCV_FISHEYE",
     ),
-    (edited(lambda f, c: f[1].update(is_fisheye=True)), "frame 1 .* got .is_fisheye"),
+    (
+        edited(lambda f, c: f[1].update(is_fisheye=True)),
+        "is_fisheye of frame 1 .* must be 0, got True",
+    ),
     (edited(lambda f, c: c.update(k3=0.01)), "k3 of frame 0 .* must be 0, got 0.01"),
     (edited(lambda f, c: c.update(fl_x="50")), "fl_x of frame 0 .* must be a number"),
     (edited(lambda f, c: c.update(fl_x=-50)), "fl_x of frame 0 .* must be positive"),
@@ -478,6 +481,17 @@ def test_textures_lie_on_triangles_and_are_averaged(azimuth, wrap, low, high, le
     assert inner.sum() > 100
     error = np.square(drawn - expected)[inner][:, :3].mean()
     assert -10 * math.log10(error) > least
+
+
+def test_large_textures_are_halved_and_look_alike(monkeypatch):
+    pixels = np.random.default_rng(0).integers(0, 256, (5, 4, 3), dtype=np.uint8)
+    mesh = textured_plate(pixels.repeat(60, axis=0).repeat(75, axis=1), ("repeat", "mirror"), 0, 1)
+    cameras = orbit(1, 20.0, DISTANCE, ANGLE, width=48, height=48, azimuth=30.0)
+    before = draw_mesh(mesh, cameras)
+    # Two halvings: to 75 x 75.
+    monkeypatch.setattr(meshes, "MAX_TEXELS", 6000)
+    error = np.abs(draw_mesh(mesh, cameras) - before)
+    assert 0.0 < error.mean() < 0.004
 
 
 def test_factors_multiply_textures_in_linear_light():

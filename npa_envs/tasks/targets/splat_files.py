@@ -35,11 +35,15 @@ give pictures 4 dB farther from the surface's."""
 POINT_OPACITY = 0.99
 """Opacity in the middle of a point's Gaussian."""
 
-MAX_POINTS = 2**20
-"""Maximum number of points of a cloud; evenly spaced ones are taken of more."""
+MAX_POINTS = 2**18
+"""Maximum number of points of a cloud, two for each pixel's width of a view of 192 pixels; evenly
+spaced ones are taken of more."""
 
 SAMPLES = 4
 """Samples along each side of a pixel: Gaussians are blurred by half a sample, not half a pixel."""
+
+MAX_SIDE = 4096
+"""Maximum number of samples along a side of a picture; large pictures have fewer in a pixel."""
 
 VISIBLE_OPACITY = 0.1
 """Gaussians of this opacity at least say where a scene is, and how large."""
@@ -161,7 +165,7 @@ def _points(file: MeshFile, vertex: Element) -> Splats:
     file.count_left_out(int((~finite).sum()), "point without a place", "points without a place")
     step = -(-len(points) // MAX_POINTS)
     if step > 1:
-        file.left_out(f"all but every {step}th of {len(points)} points")
+        file.left_out(f"all points but one of {step}, as there are {len(points)}")
     points, colours = points[finite][::step], colours[finite][::step]
     unique, first = np.unique(points, axis=0, return_index=True)
     if len(unique) <= NEIGHBOURS:
@@ -219,11 +223,12 @@ def draw_splats(splats: Splats, cameras: Cameras) -> Tensor:
 
     Gaussians have their own colours, without the light of meshes.
     """
+    samples = max(1, min(SAMPLES, MAX_SIDE // max(cameras.width, cameras.height)))
     fine = replace(
         cameras,
-        intrinsics=SAMPLES * cameras.intrinsics,
-        width=SAMPLES * cameras.width,
-        height=SAMPLES * cameras.height,
+        intrinsics=samples * cameras.intrinsics,
+        width=samples * cameras.width,
+        height=samples * cameras.height,
     )
     pictures = []
     for k, motion in enumerate(cameras.world_to_camera):
@@ -239,7 +244,7 @@ def draw_splats(splats: Splats, cameras: Cameras) -> Tensor:
             camera,
         )
         picture = torch.cat((drawn.image, drawn.alpha[..., None]), dim=-1)
-        sides = (cameras.height, SAMPLES, cameras.width, SAMPLES, 4)
+        sides = (cameras.height, samples, cameras.width, samples, 4)
         coarse = picture.view(sides).mean(dim=(1, 3))
         coarse[..., :3] = torch.minimum(coarse[..., :3], coarse[..., 3:])
         pictures.append(coarse)

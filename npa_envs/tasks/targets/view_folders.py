@@ -56,10 +56,9 @@ LENS_MODELS = ("PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV",
 
 _SUFFIXES = (".png", ".jpg", ".jpeg", ".webp")
 _DISTORTION = ("k1", "k2", "p1", "p2")
-_LENS = (
-    "camera_model", "camera_angle_x", "camera_angle_y", "fl_x", "fl_y", "cx", "cy", "w", "h",
-    "is_fisheye", *_DISTORTION, "k3", "k4", "k5", "k6", "rolling_shutter",
-)  # fmt: skip
+_NUMBERS = ("camera_angle_x", "camera_angle_y", "fl_x", "fl_y", "cx", "cy", "w", "h", *_DISTORTION)
+_UNUSABLE = ("k3", "k4", "k5", "k6", "is_fisheye", "ftheta_p0", "latlong", "equirectangular")
+_LENS = ("camera_model", *_NUMBERS, *_UNUSABLE, "rolling_shutter")
 _NEEDLESS = (
     "frames", "file_path", "transform_matrix", "rotation", "sharpness", "aabb_scale", "scale",
     "offset", "n_frames", "colmap_im_id", "applied_transform", "applied_scale", "ply_file_path",
@@ -243,24 +242,20 @@ def lens_of(frame: Frame, size: tuple[int, int]) -> Lens:
     """Return the lens in front of a picture of this width and height [pixels]."""
     given, where = frame.lens, frame.where
     model = str(given.get("camera_model", "PINHOLE")).upper()
-    if model not in LENS_MODELS or given.get("is_fisheye"):
-        model = model if model not in LENS_MODELS else "is_fisheye"
+    if model not in LENS_MODELS:
         raise NPAError(
             f"camera_model of {where} must be a pinhole with distortion k1, k2, p1, p2, got "
             f"{shown(model)}: undistort the pictures; {suggest(model, LENS_MODELS)}"
         )
-    for name, value in given.items():
-        if name not in ("camera_model", "is_fisheye", "rolling_shutter") and not is_real(value):
-            raise NPAError(f"{name} of {where} must be a number, got {shown(value)}")
-    shutter = given.get("rolling_shutter", 0)
-    unusable = [name for name in ("k3", "k4", "k5", "k6") if given.get(name)]
-    if np.any(shutter if isinstance(shutter, list | int | float) else 0):
-        unusable.append("rolling_shutter")
+    unusable = [name for name in (*_UNUSABLE, "rolling_shutter") if np.any(given.get(name))]
     if unusable:
         raise NPAError(
             f"{unusable[0]} of {where} must be 0, got {shown(given[unusable[0]])}: undistort the "
             "pictures, only k1, k2, p1 and p2 are used"
         )
+    for name in _NUMBERS:
+        if not is_real(given.get(name, 0)):
+            raise NPAError(f"{name} of {where} must be a number, got {shown(given[name])}")
     width, height = given.get("w", size[0]), given.get("h", size[1])
     if min(width, height) <= 0 or abs(width / height * size[1] / size[0] - 1.0) > 0.01:
         raise NPAError(
