@@ -118,10 +118,10 @@ class MeshFile:
             content = read()
             image = None if content is None else decode_image(content, label=label)
         except NPAError as error:
-            self.left_out(f"a texture, as {error}")
+            self.left_out(f"a texture: {error}")
             return None
         if image is None:
-            self.left_out(f"the texture {shown(label)}, which is not there: put it beside the file")
+            self.left_out(f"a texture: {shown(label)} is not there: put it beside the file")
             return None
         self._texels += image.width * image.height
         if self._texels > _MAX_TEXELS:
