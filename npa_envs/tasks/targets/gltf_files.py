@@ -244,7 +244,7 @@ class _Gltf:
             points = part.vertices @ places[:, :3, :3].mT + places[:, None, :3, 3]
             faces = (part.faces.reshape(-1)[where] + starts).reshape(-1, 3)
             colours = part.colours.reshape(-1, 3)[where].reshape(-1, 3, 3)
-            uv = None if part.uv is None else part.uv.reshape(-1, 2)[where].reshape(-1, 3, 2)
+            uv = part.uv.reshape(-1, 2)[where].reshape(-1, 3, 2)
             parts.append(Part(points.reshape(-1, 3), faces, colours, uv, part.texture))
         return parts
 
