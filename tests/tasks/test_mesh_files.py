@@ -303,3 +303,322 @@ def test_nodes_place_their_meshes_and_mirrors_keep_the_outside(tmp_path):
         np.array([1, 2, 1]) * 2 * RADIUS / math.sqrt(6)
     )
     assert volume(mesh) > 0
+
+
+def test_skipped_transparency_and_light_are_told(tmp_path, caplog):
+    gltf = Gltf()
+    ghost = base([1, 1, 1, 0.0]) | {"alphaMode": "BLEND", "name": "ghost"}
+    lamp = base([0, 0, 0, 1]) | {"emissiveFactor": ORANGE_FACTOR[:3]}
+    gloss = {"KHR_materials_pbrSpecularGlossiness": {"diffuseFactor": ORANGE_FACTOR}}
+    glass = {"extensions": gloss, "alphaMode": "BLEND", **base([1, 1, 1, 1])}
+    glass["extensions"]["KHR_materials_pbrSpecularGlossiness"]["diffuseFactor"][3] = 0.4
+    opaque = base([*ORANGE_FACTOR[:3], 0.1])
+    for k, material in enumerate((opaque, ghost, lamp, glass)):
+        gltf.part({"translation": [2 * k, 0, 0]}, material=material)
+    mesh = gltf.read(tmp_path)
+    assert (len(mesh.faces), shades(mesh)) == (36, {ORANGE})
+    assert [text.split(": ", 2)[2] for text in caplog.messages] == [
+        "the invisible triangles of material 'ghost'",
+        "light: what a black material emits is read as its colour",
+        "transparency: all is opaque",
+    ]
+
+
+def test_text_files_find_their_data_and_say_what_is_not_there(tmp_path, caplog):
+    gltf = Gltf()
+    gltf.part(material=base([0, 1, 0, 1], index=gltf.texture()), TEXCOORD_0=gltf.values(UV))
+    gltf.root["images"][0] = {"uri": "Textures%20of%20it\\Red.PNG"}
+    gltf.root["buffers"] = [{"byteLength": len(gltf.data), "uri": "parts/my%20data.bin"}]
+    path = tmp_path / "mesh.gltf"
+    path.write_text(json.dumps(gltf.root), encoding="utf-8")
+    with pytest.raises(NPAError, match=r"needs 'parts/my%20data.bin', which is not there"):
+        load_mesh(path)
+    (tmp_path / "parts").mkdir()
+    (tmp_path / "parts/my data.bin").write_bytes(gltf.data)
+    cube(load_mesh(path), (0, 255, 0))
+    missing = "mesh.gltf: left out: a texture: 'Red.PNG' is not there: put it beside the file"
+    assert caplog.messages == [missing]
+    (tmp_path / "red.png").write_bytes(png(HALVES))
+    assert len(load_mesh(path).textures) == 1
+    (tmp_path / "red.png").write_bytes(b"no picture")
+    assert load_mesh(path).textures == ()
+    assert "'Red.PNG' must be a picture" in caplog.messages[-1]
+    inline = base64.b64encode(gltf.data).decode()
+    gltf.root["buffers"][0]["uri"] = f"data:application/octet-stream;base64,{inline}"
+    path.write_text(json.dumps(gltf.root), encoding="utf-8")
+    cube(load_mesh(path), (0, 255, 0))
+
+
+def deep(gltf):
+    gltf.root["nodes"][0]["children"] = [0]
+
+
+def twice(gltf):
+    gltf.root["nodes"] = [{"children": [2]}, {"children": [2]}, {"mesh": 0}]
+    gltf.root["scenes"][0]["nodes"] = [0, 1]
+
+
+def huge(gltf):
+    gltf.root["accessors"][0] |= {"count": 2**40}
+    del gltf.root["accessors"][0]["bufferView"]
+
+
+def many(gltf):
+    gltf.root["meshes"][0]["primitives"] *= 40
+    gltf.root["nodes"] = [{"mesh": 0}] * 40_000
+    gltf.root["scenes"][0]["nodes"] = list(range(40_000))
+
+
+def outside(gltf):
+    gltf.root["bufferViews"][0]["byteLength"] = 10**9
+
+
+def old(gltf):
+    gltf.root["asset"]["version"] = "1.0"
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (deep, "nodes that form a tree"),
+        (twice, "nodes that form a tree"),
+        (huge, "at most 134217728 numbers"),
+        (many, "at most 8388608 triangles, 65536 nodes and 65536 parts"),
+        (outside, "must have all of bufferViews 0"),
+        (old, r"must be of glTF 2.0, got '1.0'"),
+    ],
+)
+def test_damaged_gltf_files_are_refused(tmp_path, damage, message):
+    gltf = Gltf().part()
+    damage(gltf)
+    with pytest.raises(NPAError, match=message):
+        gltf.read(tmp_path)
+
+
+def test_no_damage_of_a_byte_is_more_than_an_error(tmp_path):
+    gltf = Gltf()
+    gltf.part(material=base(index=gltf.texture()), TEXCOORD_0=gltf.values(UV))
+    whole = gltf.save(tmp_path / "mesh.glb").read_bytes()
+    random = np.random.default_rng(0)
+    read = 0
+    for _ in range(300):
+        damaged = bytearray(whole)
+        for place in random.integers(12, len(whole), 3):
+            damaged[place] = random.integers(256)
+        (tmp_path / "mesh.glb").write_bytes(damaged)
+        try:
+            read += np.isfinite(load_mesh(tmp_path / "mesh.glb").vertices).all()
+        except NPAError as error:
+            assert len(str(error)) < 1000
+    assert 0 < read < 300
+
+
+# Formats of text, and PLY.
+
+
+def ply(vertices, faces, vertex="", face="", kind="ascii", count="uchar int", comment=""):
+    """Return a PLY file; rows of numbers, a face's first is a list; properties are `type name`."""
+    head = f"ply\nformat {kind} 1.0\n{comment}element vertex {len(vertices)}\n"
+    names = ["float x", "float y", "float z", *filter(None, vertex.split(", "))]
+    head += "".join(f"property {name}\n" for name in names) + f"element face {len(faces)}\n"
+    extra = list(filter(None, face.split(", ")))
+    head += f"property list {count} vertex_indices\n"
+    head += "".join(f"property {name}\n" for name in extra) + "end_header\n"
+    if kind == "ascii":
+        rows = [*vertices, *([len(f), *f, *more] for f, *more in faces)]
+        return (head + "".join(" ".join(map(str, row)) + "\n" for row in rows)).encode()
+    codes = {"float": "f", "uchar": "B", "int": "i", "ushort": "H", "double": "d"}
+    data = b"".join(
+        struct.pack(">" + "".join(codes[name.split()[0]] for name in names), *row)
+        for row in vertices
+    )
+    for corners, *more in faces:
+        form = f">B{len(corners)}i" + "".join(codes[name.split()[0]] for name in extra)
+        data += struct.pack(form, len(corners), *corners, *more)
+    return head.encode() + data
+
+
+RGB = "red, {0} green, {0} blue"
+SIX = [(255, 0, 0), (0, 255, 0), (0, 0, 255), (255, 255, 0), (0, 255, 255), (255, 0, 255)]
+CORNERS = CUBE.tolist()
+
+
+def off(head, more=(), *, faces=()):
+    rows = [[*corner, *more] for corner in CORNERS]
+    sides = [[4, *side, *shade] for side, shade in zip(SIDES, faces or [()] * 6, strict=True)]
+    return "\n".join(
+        [head, "# corners", *(" ".join(map(str, row)) for row in (*rows, *sides))]
+    ).encode()
+
+
+def stl(words, head=b""):
+    rows = (
+        struct.pack("<12fH", 0, 0, 0, *CUBE[t].ravel(), w)
+        for t, w in zip(TRIANGLES, words, strict=True)
+    )
+    return head.ljust(80) + struct.pack("<I", 12) + b"".join(rows)
+
+
+ROWS = [[*corner, *ORANGE] for corner in CORNERS]
+SIDE_LISTS = [[side] for side in SIDES]
+ENDED = [[*corner, 0.7843, 0.19608, 0.07843] for corner in CORNERS]
+OBJ = "".join("v {} {} {}\n".format(*corner) for corner in CORNERS)
+OBJ_SIDES = "".join("f {} {} {} {}\n".format(*(k + 1 for k in side)) for side in SIDES)
+ONE_BLUE = [0x7C00 | 0x8000] * 11 + [0x801F]
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "colours"),
+    [
+        ("a.ply", ply(ROWS, SIDE_LISTS, "uchar " + RGB.format("uchar")), {ORANGE}),
+        ("b.ply", ply(ROWS, SIDE_LISTS, "uchar diffuse_red, uchar diffuse_green, uchar diffuse_blue"), {ORANGE}),
+        ("c.ply", ply(ROWS, SIDE_LISTS, "float " + RGB.format("float")), {ORANGE}),
+        ("d.ply", ply(ENDED, SIDE_LISTS, "double " + RGB.format("double")), {ORANGE}),
+        ("e.ply", ply([[*c, 51400, 12850, 5140] for c in CORNERS], SIDE_LISTS, "ushort " + RGB.format("ushort"), kind="binary_big_endian"), {ORANGE}),
+        ("f.ply", ply(CORNERS, [[s, *c] for s, c in zip(SIDES, SIX, strict=True)], face="uchar " + RGB.format("uchar")), set(SIX)),
+        ("g.ply", ply(CORNERS, [[s, *ORANGE] for s in (*SIDES[1:], *TRIANGLES[:2].tolist())], face="uchar " + RGB.format("uchar"), kind="binary_big_endian"), {ORANGE}),
+        ("a.off", off("COFF\n8 6 0", (*ORANGE, 255)), {ORANGE}),
+        ("b.off", off("OFF 8 6 12", (0.7843, 0.19608, 0.07843, 1)), {ORANGE}),
+        ("c.off", off("OFF\n8 6 0", faces=SIX), set(SIX)),
+        ("d.off", off("CNOFF\n8 6 0", (0, 0, 1, *ORANGE, 255)), {ORANGE}),
+        ("a.stl", stl(ONE_BLUE), {(255, 0, 0), (0, 0, 255)}),
+        ("b.stl", stl([0x8000] * 11 + [0x7C00], b"COLOR=" + bytes((*ORANGE, 255))), {ORANGE, (0, 0, 255)}),
+        ("a.obj", "".join("v {} {} {} 0.7843 0.19608 0.07843\n".format(*c) for c in CORNERS) + OBJ_SIDES, {ORANGE}),
+        ("b.obj", "mtllib my colours.mtl\nusemtl the red\n" + OBJ + OBJ_SIDES, {(255, 0, 0)}),
+        ("c.obj", ("mtllib my colours.mtl\n" + OBJ + "usemtl the red\n" + OBJ_SIDES).encode("utf-16"), {(255, 0, 0)}),
+        ("d.obj", "mtllib my colours.mtl\nvt 0 0\n" + OBJ + "usemtl the red\n" + OBJ_SIDES.replace("f 1 ", "f 1/1 ").replace("\nf", "\nusemtl green\nf", 1), {(255, 0, 0), (0, 255, 0)}),
+        ("e.obj", "mtllib my colours.mtl\nusemtl the red\n" + "".join("".join("v {} {} {}\n".format(*CORNERS[k]) for k in side) + "f -4 -3 \\\n-2 -1\n" for side in SIDES), {(255, 0, 0)}),
+    ],
+)  # fmt: skip
+def test_colours_of_corners_polygons_and_materials_are_read(
+    tmp_path, caplog, name, content, colours
+):
+    pytest.importorskip("trimesh")
+    (tmp_path / "my colours.mtl").write_text(
+        "newmtl the red\nKd 1 0 0\nnewmtl green\nKd 0 1 0\n", encoding="utf-8"
+    )
+    path = tmp_path / name
+    path.write_bytes(content if isinstance(content, bytes) else content.encode())
+    cube(load_mesh(path), *colours)
+    assert caplog.messages == []
+
+
+def test_shapes_without_colours_are_grey_with_a_word(tmp_path, caplog):
+    (tmp_path / "miss.obj").write_text(
+        "mtllib none.mtl\n" + OBJ + "usemtl r\nl 1 2\n" + OBJ_SIDES, encoding="utf-8"
+    )
+    mesh = load_mesh(tmp_path / "miss.obj")
+    cube(mesh, (153, 153, 153))
+    assert mesh.summary == "miss.obj: 12 triangles, no colours"
+    assert [text.split(": ", 2)[2] for text in caplog.messages] == [
+        "1 element of lines",
+        "the materials of 'none.mtl', which is not there",
+        "the material 'r', which no .mtl file here has",
+        "colours, as the file has none: all is grey",
+    ]
+
+
+def test_textures_of_obj_and_ply_files_have_v_upwards(tmp_path, caplog):
+    for name in ("halves.png", "my halves.png"):
+        (tmp_path / name).write_bytes(png(HALVES))
+    (tmp_path / "t.mtl").write_text(
+        "newmtl r\nKd 0 0 0\nmap_Kd -s 2 3 1 -clamp on my halves.png\nd 0.5\n", encoding="utf-8"
+    )
+    text = (
+        "mtllib t.mtl\nusemtl r\nv 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 0 1\nf 1/1 2/2 3/3\n"
+    )
+    (tmp_path / "t.obj").write_text(text, encoding="utf-8")
+    mesh = load_mesh(tmp_path / "t.obj")
+    assert mesh.uv.tolist() == [[[0, 1], [1, 1], [0, 0]]]
+    assert np.array_equal(mesh.textures[0].pixels, HALVES)
+    assert shades(mesh) == {(255, 255, 255)}
+    assert mesh.summary == "t.obj: 1 triangles, texture 2 x 2, 1 material"
+    assert [text.split(": ", 2)[2] for text in caplog.messages] == [
+        "options of the texture '-s 2 3 1 -clamp on my halves.png'",
+        "black of a material with a texture, as it would hide that",
+        "transparency: all is opaque",
+    ]
+    square = [(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0)]
+    image = "comment TextureFile halves.png\n"
+    rows = [[*corner, corner[0], corner[1]] for corner in square]
+    (tmp_path / "a.ply").write_bytes(ply(rows, [[range(4)]], "float s, float t", comment=image))
+    own = [[range(4), 8, *(k for row in square for k in row[:2])]]
+    (tmp_path / "b.ply").write_bytes(
+        ply(square, own, face="list uchar float texcoord", comment=image)
+    )
+    for name in ("a.ply", "b.ply"):
+        mesh = load_mesh(tmp_path / name)
+        assert mesh.uv[0].tolist() == [[0, 1], [1, 1], [1, 0]]
+        assert mesh.textures[0].wrap == ("repeat", "repeat")
+
+
+# Polygons.
+
+
+def star(count, seed):
+    """Return a polygon that is not convex, in a plane of space, and its area."""
+    random = np.random.default_rng(seed)
+    angle = np.sort(random.uniform(0, math.tau, count))
+    flat = random.uniform(0.2, 1.0, (count, 1)) * np.stack((np.cos(angle), np.sin(angle)), axis=1)
+    following = np.roll(flat, -1, axis=0)
+    size = (flat[:, 0] * following[:, 1] - flat[:, 1] * following[:, 0]).sum() / 2
+    turn = np.linalg.qr(random.normal(size=(3, 3)))[0]
+    return flat @ turn[:2] + random.normal(size=3), size
+
+
+def covered(points, triangles):
+    """Return the sum of areas of triangles, and that of areas with the direction of the sum."""
+    a, b, c = (points[triangles[:, k]] for k in range(3))
+    outward = np.cross(b - a, c - a) / 2
+    return np.linalg.norm(outward, axis=1).sum(), np.linalg.norm(outward.sum(axis=0))
+
+
+@pytest.mark.parametrize("count", [4, 5, 9, 30, 300])
+def test_polygons_that_are_not_convex_are_covered_once(count):
+    stars = [star(count, seed) for seed in range(6)]
+    counts = np.full(6, count)
+    points = np.concatenate([points for points, _ in stars])
+    triangles, owners = triangulated(points, counts)
+    assert np.bincount(owners).tolist() == [count - 2] * 6
+    for k, (_, size) in enumerate(stars):
+        assert covered(points, triangles[owners == k]) == pytest.approx((size, size), rel=1e-9)
+
+
+def test_a_hole_that_is_joined_to_the_outline_stays_open():
+    outline = [(0, 0), (4, 0), (4, 4), (0, 4)]
+    hole = [(1, 1), (1, 3), (3, 3), (3, 1)]
+    ring = np.array([*outline, outline[0], *hole, hole[0]], dtype=float)
+    points = np.pad(ring, ((0, 0), (0, 1)))
+    triangles, _ = triangulated(points, np.array([len(points)]))
+    assert covered(points, triangles) == pytest.approx((12, 12))
+    middles = points[triangles].mean(axis=1)[:, :2]
+    assert not ((middles > 1) & (middles < 3)).all(axis=1).any()
+
+
+@pytest.mark.parametrize("suffix", [".obj", ".ply", ".off"])
+def test_arrows_in_files_keep_their_area(tmp_path, suffix):
+    """A dart has its notch at any of its four corners, an arrow with a shaft has seven."""
+    dart = [(0, 0, 0), (2, 1, 0), (0, 2, 0), (0.5, 1, 0)]
+    shaft = [(0, 1, 0), (2, 1, 0), (2, 0, 0), (4, 1.5, 0), (2, 3, 0), (2, 2, 0), (0, 2, 0)]
+    for size, outline in [(1.5, dart[k:] + dart[:k]) for k in range(4)] + [(5.0, shaft)]:
+        order = range(len(outline))
+        rows = "\n".join("{} {} {}".format(*p) for p in outline)
+        content = {
+            ".obj": "v "
+            + rows.replace("\n", "\nv ")
+            + "\nf "
+            + " ".join(str(k + 1) for k in order),
+            ".ply": ply(outline, [[order]]).decode(),
+            ".off": f"OFF\n{len(outline)} 1 0\n{rows}\n{len(outline)} " + " ".join(map(str, order)),
+        }[suffix]
+        (tmp_path / f"arrow{suffix}").write_text(content, encoding="utf-8")
+        mesh = load_mesh(tmp_path / f"arrow{suffix}")
+        scale = np.ptp(mesh.vertices[:, 0]) / np.ptp(np.array(outline)[:, 0])
+        flat = covered(mesh.vertices, mesh.faces)
+        assert flat == pytest.approx((size * scale**2,) * 2)
+
+
+def test_views_say_what_was_read(tmp_path):
+    path = Gltf().part(material=base(ORANGE_FACTOR)).save(tmp_path / "box.glb")
+    target = load_views(path, resolution=8, training_count=1, held_out_count=1)
+    assert target.summary == "box.glb: 12 triangles, 1 material"

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import functools
 import io
 import re
 import struct
 import warnings
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -23,7 +25,7 @@ from npa_envs.tasks.targets.mesh_parts import (
     strip,
     unit_colours,
 )
-from npa_envs.tasks.targets.meshes import MAX_FILE, FloatArray, Mesh, Texture
+from npa_envs.tasks.targets.meshes import MAX_FILE, FloatArray, Mesh
 from npa_envs.tasks.targets.obj_files import read_obj
 
 _MAX_UV = 1e6
@@ -55,63 +57,50 @@ def read_mesh(path: Path) -> Mesh:
 
 def _joined(file: MeshFile, parts: list[Part]) -> Mesh:
     """Return the mesh of a file's parts."""
-    total = sum(len(part.faces) for part in parts)
-    if not total:
-        raise file.error("must hold triangles, got none: give a surface, not a point cloud")
-    if total > MAX_TRIANGLES:
-        raise file.error(f"must have at most {MAX_TRIANGLES} triangles, got {total}: simplify it")
-    starts: dict[int, int] = {}
-    vertices: list[FloatArray] = []
-    textures: list[Texture] = []
-    faces, colours, uv, texture_of_face = [], [], [], []
-    for part in parts:
-        file.check_corners(part.vertices, part.faces)
-        if id(part.vertices) not in starts:
-            starts[id(part.vertices)] = sum(map(len, vertices))
-            vertices.append(part.vertices)
-        index, place = -1, np.zeros((len(part.faces), 3, 2)) if part.uv is None else part.uv
-        if part.texture is not None and len(part.faces):
-            if not any(part.texture is other for other in textures):
-                textures.append(part.texture)
-            index = [part.texture is other for other in textures].index(True)
-        placed = np.isfinite(place).all(axis=(1, 2))
-        file.count_left_out(
-            int((~placed).sum()) if index >= 0 else 0,
-            "triangle's texture, as it has no texture coordinates",
-            "triangles' texture, as they have no texture coordinates",
+    sizes = [len(part.faces) for part in parts]
+    total = sum(sizes)
+    if not 0 < total <= MAX_TRIANGLES:
+        raise file.error(
+            f"must hold triangles, at most {MAX_TRIANGLES}, got {total}: give a surface, not a "
+            "point cloud"
         )
-        given = np.full((len(part.faces), 3, 3), np.nan) if part.colours is None else part.colours
-        textured = placed & (index >= 0)
-        colours.append(np.where(textured[:, None, None] & np.isnan(given), 1.0, given))
-        faces.append(part.faces + starts[id(part.vertices)])
-        uv.append(np.where(placed[:, None, None], place, 0.0).clip(-_MAX_UV, _MAX_UV))
-        texture_of_face.append(np.where(textured, index, -1))
-    colour = np.concatenate(colours)
-    plain = ~np.isfinite(colour).all(axis=(1, 2))
-    colour[plain] = file.plain
+    shared = {id(part.vertices): part.vertices for part in parts}
+    vertices = np.concatenate(list(shared.values()))
+    ends = np.cumsum([len(each) for each in shared.values()])
+    starts = dict(zip(shared, [0, *ends.tolist()], strict=False))
+    faces = np.concatenate([part.faces + starts[id(part.vertices)] for part in parts])
+    file.check_corners(vertices, faces)
+    _check_size(file, vertices, faces)
+    textures = [part.texture for part in parts if part.texture is not None and len(part.faces)]
+    number = {texture: k for k, texture in enumerate(dict.fromkeys(textures))}
+    texture_of_face = np.repeat(
+        [-1 if p.texture is None else number.get(p.texture, -1) for p in parts], sizes
+    )
+    colours, uv = (np.concatenate([getattr(p, key) for p in parts]) for key in ("colours", "uv"))
+    lost = (texture_of_face >= 0) & ~np.isfinite(uv).all(axis=(1, 2))
+    what = "texture of {}, without coordinates in it"
+    file.count_left_out(int(lost.sum()), what.format("triangle"), what.format("triangles"))
+    texture_of_face[lost] = -1
+    colours[(texture_of_face >= 0)[:, None, None] & np.isnan(colours)] = 1.0
+    plain = ~np.isfinite(colours).all(axis=(1, 2))
+    colours[plain] = file.plain
     if plain.any():
         which = "the file has none" if plain.all() else f"{plain.sum()} triangles have none"
         shade = "white" if file.plain == 1.0 else "grey"
         file.left_out(f"colours, as {which}: {'all is' if plain.all() else 'they are'} {shade}")
     looks = [f"{total} triangles"]
-    if len(textures) == 1:
-        looks.append("texture {1} x {0}".format(*textures[0].pixels.shape))
-    elif textures:
-        looks.append(f"{len(textures)} textures")
+    if number:
+        size = "texture {1} x {0}".format(*textures[0].pixels.shape)
+        looks.append(size if len(number) == 1 else f"{len(number)} textures")
     if file.materials:
         looks.append(f"{len(file.materials)} material" + "s" * (len(file.materials) > 1))
-    elif not textures:
+    elif not number:
         looks.append("no colours" if plain.all() else "colours of corners or faces")
-    mesh = Mesh(
-        np.concatenate(vertices),
-        np.concatenate(faces),
-        colour.clip(0.0, 1.0),
-        np.concatenate(uv) if textures else None,
-        np.concatenate(texture_of_face) if textures else None,
-        tuple(textures),
-        summary=f"{file.path.name}: {', '.join(looks)}",
-    )
-    _check_size(file, mesh.vertices, mesh.faces)
+    summary = f"{file.path.name}: {', '.join(looks)}"
+    mesh = Mesh(vertices, faces, colours.clip(0.0, 1.0), summary=summary)
+    if number:
+        uv = np.nan_to_num(uv).clip(-_MAX_UV, _MAX_UV)
+        mesh = replace(mesh, uv=uv, texture_of_face=texture_of_face, textures=tuple(number))
     return mesh
 
 
@@ -141,7 +130,6 @@ _PLY_TYPES = {
     "int64": "i8", "uint64": "u8", "float16": "f2", "float": "f4", "float32": "f4",
     "double": "f8", "float64": "f8",
 }  # fmt: skip
-_PLY_UV = (("s", "t"), ("u", "v"), ("texture_u", "texture_v"))
 
 
 class PlyProperty(NamedTuple):
@@ -194,53 +182,40 @@ def _read_rows(
     def stored(kind: str) -> np.dtype[Any]:
         return np.dtype(np.float64 if order == "=" else order + _PLY_TYPES[kind])
 
-    values: dict[str, NDArray[Any]] = {key: np.empty(0) for key, _, _ in properties}
-    counts = {key: np.empty(0, dtype=np.int64) for key in values}
-    lengths: dict[str, int] = {}
-    fields: list[Any] = []
-    for key, counted, kind in properties if count else []:
-        if counted:
-            place = start + np.dtype(fields).itemsize
-            lengths[key] = int(np.frombuffer(data, stored(counted), 1, place)[0])
-            fields.append((f"{key}, count", stored(counted)))
-        fields.append((key, stored(kind), (lengths.get(key, 1),)))
-    row, end = np.dtype(fields), start
-    if count and start + count * row.itemsize <= len(data):
-        rows = np.frombuffer(data, row, count, start)
-        end = start + rows.nbytes
-        if any((rows[f"{key}, count"] != length).any() for key, length in lengths.items()):
-            end = start
-        values = {key: rows[key].reshape(-1) for key in values}
-        counts = {key: np.full(count, lengths.get(key, 1)) for key in values}
-    if count and end == start:
-        # Lists of different lengths.
-        plan = [
-            (
-                key,
-                struct.Struct(order + stored(counted).char.replace("l", "q")) if counted else None,
-                stored(kind),
-            )
-            for key, counted, kind in properties
-        ]
-        pieces: dict[str, list[bytes]] = {key: [] for key in values}
-        sizes: dict[str, list[int]] = {key: [] for key in values}
-        for _ in range(count):
-            for key, counter, kind_stored in plan:
-                length = 1
-                if counter is not None:
-                    length = int(counter.unpack_from(data, end)[0])
-                    end += counter.size
-                sizes[key].append(length)
-                pieces[key].append(data[end : end + length * kind_stored.itemsize])
-                end += length * kind_stored.itemsize
-                if length < 0 or end > len(data):
-                    raise ValueError("it ends too early")
-        values = {key: np.frombuffer(b"".join(pieces[key]), kind) for key, _, kind in plan}
-        counts = {key: np.array(sizes[key]) for key in values}
-    return {
-        key: PlyProperty(values[key].astype(_PLY_TYPES[kind]), counts[key])
-        for key, _, kind in properties
-    }, end
+    declared = {key: _PLY_TYPES[kind] for key, _, kind in properties}
+    if not any(counted for _, counted, _ in properties):
+        fields = [(key, stored(kind)) for key, _, kind in properties]
+        rows = np.frombuffer(data, fields, count, start) if count else np.empty(0, fields)
+        ones = np.ones(count, dtype=np.int64)
+        return {
+            k: PlyProperty(rows[k].astype(declared[k]), ones) for k in declared
+        }, start + rows.nbytes
+    plan = [
+        (
+            struct.Struct(order + stored(counted).char.replace("l", "q")) if counted else None,
+            stored(kind),
+        )
+        for _, counted, kind in properties
+    ]
+    pieces: list[list[bytes]] = [[] for _ in plan]
+    counts: list[list[int]] = [[] for _ in plan]
+    for _ in range(count):
+        for k, (counter, kind_stored) in enumerate(plan):
+            length = 1
+            if counter is not None:
+                length = int(counter.unpack_from(data, start)[0])
+                start += counter.size
+            end = start + length * kind_stored.itemsize
+            if not start <= end <= len(data):
+                raise ValueError("it ends too early")
+            counts[k].append(length)
+            pieces[k].append(data[start:end])
+            start = end
+    found = {}
+    for k, (key, _, kind) in enumerate(properties):
+        values = np.frombuffer(b"".join(pieces[k]), stored(kind))
+        found[key] = PlyProperty(values.astype(declared[key]), np.array(counts[k], dtype=np.int64))
+    return found, start
 
 
 def ply_colours(file: MeshFile, element: dict[str, PlyProperty]) -> FloatArray | None:
@@ -254,57 +229,45 @@ def ply_colours(file: MeshFile, element: dict[str, PlyProperty]) -> FloatArray |
 
 
 def _read_ply_parts(file: MeshFile, content: bytes) -> list[Part]:
-    """Return the parts of a PLY file, one for each texture."""
+    """Return the parts of a PLY file, one for each texture, and one for strips of triangles."""
     elements, comments = read_ply(content)
-    vertex, face, strips = (elements.get(key, {}) for key in ("vertex", "face", "tristrips"))
+    vertex, face = elements.get("vertex", {}), elements.get("face", {})
     vertices = np.stack([vertex[key].values.astype(np.float64) for key in "xyz"], axis=1)
-    key = next((key for key in ("vertex_indices", "vertex_index") if key in face), None)
-    nothing = PlyProperty(np.empty(0), np.empty(0, dtype=np.int64))
-    indices = face[key] if key else nothing
+    nothing = PlyProperty(np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64))
+    indices = face.get("vertex_indices", face.get("vertex_index", nothing))
     flat = indices.values.astype(np.int64)
     corners, owners = file.polygons(vertices, flat, indices.counts)
+    faces, colours, uv, parts = flat[corners], None, None, []
     at_corners, of_rows = ply_colours(file, vertex), ply_colours(file, face)
-    if "material_index" in face and "material" in elements:
-        palette = ply_colours(file, elements["material"])
-        of_rows = palette if palette is None else palette[face["material_index"].values]
-    colours = None
     if at_corners is not None and (of_rows is None or np.ptp(at_corners, axis=0).any()):
-        colours = at_corners[flat[corners]]
+        colours = at_corners[faces]
         if of_rows is not None:
             file.left_out("colours of polygons, as their corners have some as well")
     elif of_rows is not None:
         colours = np.repeat(of_rows[owners][:, None], 3, axis=1)
-    uv = None
     if "texcoord" in face and np.array_equal(face["texcoord"].counts, 2 * indices.counts):
-        uv = face["texcoord"].values.reshape(-1, 2).astype(np.float64)[corners]
-    for u, v in _PLY_UV:
+        uv = face["texcoord"].values.reshape(-1, 2)[corners]
+    for u, v in (("s", "t"), ("u", "v"), ("texture_u", "texture_v")):
         if uv is None and u in vertex and v in vertex:
-            uv = np.stack((vertex[u].values, vertex[v].values), axis=1).astype(np.float64)
-            uv = uv[flat[corners]]
-    if uv is not None:
-        # In this format v goes up.
-        uv = uv * (1.0, -1.0) + (0.0, 1.0)
-    texture_numbers = np.zeros(len(indices.counts), dtype=np.int64)
-    if "texnumber" in face:
-        texture_numbers = face["texnumber"].values.astype(np.int64)
-    parts = []
+            uv = np.stack((vertex[u].values, vertex[v].values), axis=1)[faces]
     names = [text[12:].strip() for text in comments if text.lower().startswith("texturefile ")]
-    for number in np.unique(texture_numbers):
-        chosen = texture_numbers[owners] == number
-        texture = None
+    numbers = face["texnumber"].values[owners] if "texnumber" in face else np.zeros(len(faces))
+    for number in np.unique(numbers):
+        chosen, texture = numbers == number, None
         if uv is not None and 0 <= number < len(names):
-            name = names[number]
-            texture = file.texture(
-                name, lambda name=name: file.neighbour(name), ("repeat", "repeat")
-            )
-        part = Part(vertices, flat[corners][chosen], None if colours is None else colours[chosen])
+            name = names[int(number)]
+            read = functools.partial(file.neighbour, name)
+            texture = file.texture(name, read, ("repeat", "repeat"))
+        part = Part(vertices, faces[chosen], None if colours is None else colours[chosen])
         if texture is not None and uv is not None:
-            part.uv, part.texture, part.colours = uv[chosen], texture.texture, None
+            # In this format v goes up.
+            flipped = uv[chosen] * (1.0, -1.0) + (0.0, 1.0)
+            part = Part(vertices, faces[chosen], None, flipped, texture.texture)
         parts.append(part)
-    if "vertex_indices" in strips:
-        values = strips["vertex_indices"].values.astype(np.int64)
-        ends = np.flatnonzero(values == -1)
-        faces = np.concatenate([strip(run[run != -1]) for run in np.split(values, ends)])
+    if "tristrips" in elements:
+        values = elements["tristrips"]["vertex_indices"].values.astype(np.int64)
+        runs = np.split(values, np.flatnonzero(values == -1))
+        faces = np.concatenate([strip(run[run != -1]) for run in runs])
         file.check_corners(vertices, faces)
         parts.append(Part(vertices, faces, None if at_corners is None else at_corners[faces]))
     return parts
@@ -315,48 +278,38 @@ def _read_ply_parts(file: MeshFile, content: bytes) -> list[Part]:
 
 def _read_off(file: MeshFile, content: bytes) -> list[Part]:
     """Return the part of an OFF file, with colours of corners or polygons."""
-    rows = [line.split("#")[0].split() for line in content.decode("latin-1").splitlines()]
-    rows = [row for row in rows if row]
-    head = re.fullmatch(r"(ST)?(C?)(N?)(4?)(n?)OFF", rows[0][0])
+    lines = (line.split("#")[0].split() for line in content.decode("latin-1").splitlines())
+    rows = [line for line in lines if line]
+    head = re.fullmatch(r"(ST)?C?(N?)(4?n?)OFF", rows[0][0])
     if head is not None:
-        rows[0] = rows[0][1:]
-        rows = rows if rows[0] else rows[1:]
-    kind = head[0] if head is not None else "OFF"
-    if "4" in kind or "n" in kind or rows[0][0] == "BINARY":
-        raise file.error(f"must be an OFF file of text in three dimensions, got {kind}: save a PLY")
-    vertex_count, face_count = (int(word) for word in rows[0][:2])
-    if min(vertex_count, face_count) < 0 or len(rows) < 1 + vertex_count + face_count:
-        raise file.error(
-            f"must have {vertex_count} + {face_count} lines after the first, as that says, got "
-            f"{len(rows) - 1}: save it again"
-        )
-    first = 6 if "N" in kind else 3
-    corners = [[float(word) for word in row] for row in rows[1 : 1 + vertex_count]]
+        rows = ([rows[0][1:]] if rows[0][1:] else []) + rows[1:]
+    if (head is not None and head[3]) or rows[0][0] == "BINARY":
+        raise file.error("must be an OFF file of text in three dimensions: save it as PLY")
+    first, last = (int(word) for word in rows[0][:2])
+    corners, faces = rows[1 : 1 + first], rows[1 + first : 1 + first + last]
+    if (len(corners), len(faces)) != (first, last) or any(len(f) <= int(f[0]) for f in faces):
+        raise file.error(f"must have {first} corners and {last} whole polygons: save it again")
     vertices = np.array([row[:3] for row in corners], dtype=np.float64).reshape(-1, 3)
-    faces = rows[1 + vertex_count : 1 + vertex_count + face_count]
     counts = np.array([int(row[0]) for row in faces], dtype=np.int64)
-    if any(len(row) <= int(row[0]) for row in faces):
-        raise file.error("has a polygon with fewer corners than it says: save it again")
     flat = np.array(
         [int(word) for row in faces for word in row[1 : int(row[0]) + 1]], dtype=np.int64
     )
     places, owners = file.polygons(vertices, flat, counts)
-    # Files that call themselves OFF have colours after x, y and z, too.
-    shades = [row[first : first + 3] for row in corners]
-    end = 5 if "ST" in kind else 3
-    if all(len(row) >= first + end for row in corners) and vertex_count:
-        return [Part(vertices, flat[places], unit_colours(np.array(shades))[flat[places]])]
-    shades = [[float(word) for word in row[int(row[0]) + 1 :][:3]] for row in faces]
-    if all(len(row) < 3 for row in shades):
-        return [Part(vertices, flat[places], None)]
-    own = [row if len(row) == 3 else [np.nan] * 3 for row in shades]
-    return [
-        Part(
-            vertices,
-            flat[places],
-            np.repeat(unit_colours(np.array(own))[owners][:, None], 3, axis=1),
+    # Files that call themselves OFF have colours after x, y, z and a normal, too.
+    start = 6 if head is not None and head[2] else 3
+    least = start + (5 if head is not None and head[1] else 3)
+    colours = None
+    if corners and all(len(row) >= least for row in corners):
+        shades = unit_colours(
+            np.array([row[start : start + 3] for row in corners], dtype=np.float64)
         )
-    ]
+        colours = shades[flat[places]]
+    elif any(len(row) > int(row[0]) + 3 for row in faces):
+        shades = np.array(
+            [(row[int(row[0]) + 1 :] + ["nan"] * 3)[:3] for row in faces], dtype=np.float64
+        )
+        colours = np.repeat(unit_colours(shades)[owners][:, None], 3, axis=1)
+    return [Part(vertices, flat[places], colours)]
 
 
 # STL. trimesh reads its triangles right, and hands over the two bytes in which colours are.

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,9 +18,6 @@ from npa_envs.tasks.targets.notes import left_out
 
 IntArray = NDArray[np.int64]
 
-GREY = 0.6
-"""Red, green and blue of triangles without a colour, if the format does not say it."""
-
 MAX_TRIANGLES = 2**23
 """Maximum number of triangles of a mesh."""
 
@@ -30,36 +27,41 @@ _MAX_SEARCHES = 32
 _VECTORISED = 40  # corners
 
 
-@dataclass(frozen=True, eq=False)
-class FileTexture:
-    """A texture of a mesh file, and its transparency, which `Texture` leaves out."""
+class FileTexture(NamedTuple):
+    """A texture of a mesh file, and the alpha of its pixels in [0, 1], which `Texture` has not."""
 
     texture: Texture
     lowest_alpha: float
     highest_alpha: float
 
 
-@dataclass(eq=False)
 class Part:
-    """Triangles of a file with the same texture, or none."""
+    """Triangles of a file, which share a texture or have none."""
 
-    vertices: FloatArray
-    """Vertices, shape [K, 3]; parts with the same array share them."""
-    faces: IntArray
-    """Vertex indices of each triangle, shape [F, 3]."""
-    colours: FloatArray | None
-    """As in `Mesh`, [F, 3, 3]. NaN: that corner has none. None: no corner has one."""
-    uv: FloatArray | None = None
-    """As in `Mesh`, [F, 3, 2]. NaN: that corner has none. None: the part has no texture."""
-    texture: Texture | None = None
+    def __init__(
+        self,
+        vertices: FloatArray,
+        faces: IntArray,
+        colours: FloatArray | None = None,
+        uv: FloatArray | None = None,
+        texture: Texture | None = None,
+    ) -> None:
+        """Take the values of `Mesh`; a corner without a colour or a place in the texture has NaN.
+
+        Parts with the same array of vertices share them.
+        """
+        self.vertices, self.faces, self.texture = vertices, faces, texture
+        shape = (len(faces), 3)
+        self.colours = np.full((*shape, 3), np.nan) if colours is None else colours
+        self.uv = np.full((*shape, 2), np.nan) if uv is None else uv
 
 
 class MeshFile:
-    """A mesh file that is read: its name in messages, and the files and textures it refers to."""
+    """A mesh file that is read: its errors, what is left out of it, and the files it names."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self.plain = GREY
+        self.plain = 0.6
         """Red, green and blue of triangles without a colour."""
         self.materials: set[object] = set()
         """The materials of triangles that were read."""
@@ -77,26 +79,23 @@ class MeshFile:
     def count_left_out(self, count: int, one: str, more: str) -> None:
         """Warn of a number of things that were left out, if there were any."""
         if count > 0:
-            self.left_out(f"1 {one}" if count == 1 else f"{count} {more}")
+            self.left_out(f"{count} {one if count == 1 else more}")
 
     def neighbour(self, name: str) -> bytes | None:
         """Return the bytes of a file that this one names, None if it is not there.
 
-        It lies in this one's folder, or below. What is named elsewhere is looked for there by its
-        last name: paths are often those of another computer.
+        It lies in this one's folder or below. Another path is often that of another computer: its
+        last name is looked for in the folder. Small and capital letters may differ.
         """
         inside = os.path.normpath(name.strip().replace("\\", "/"))
-        folder = self.path.parent
-        tries = [folder / os.path.basename(inside)]
+        folder, tries = self.path.parent, [os.path.basename(inside)]
         if not os.path.isabs(inside) and inside.split(os.sep)[0] != os.pardir:
-            tries.insert(0, folder / inside)
-        for path in tries:
-            # Names from systems where small and capital letters are the same.
-            others = sorted(path.parent.iterdir()) if path.parent.is_dir() else []
+            tries.insert(0, inside)
+        for path in (folder / each for each in tries):
+            others = sorted(path.parent.iterdir()) if path.name and path.parent.is_dir() else []
             alike = [p for p in others if p.name.casefold() == path.name.casefold()]
-            if path.name and alike:
-                found = path if path in alike else alike[0]
-                return read_bytes(found, limit=MAX_FILE, what="the file")
+            if alike:
+                return read_bytes(path if path in alike else alike[0], limit=MAX_FILE)
         return None
 
     def texture(
@@ -106,60 +105,47 @@ class MeshFile:
 
         `name` identifies it in this file.
         """
-        if (name, wrap) not in self._textures:
-            self._textures[name, wrap] = self._read_texture(name, read, wrap)
-        return self._textures[name, wrap]
-
-    def _read_texture(
-        self, name: str, read: Callable[[], bytes | None], wrap: tuple[Wrap, Wrap]
-    ) -> FileTexture | None:
-        label = os.path.basename(name.replace("\\", "/")) or name
+        if (name, wrap) in self._textures:
+            return self._textures[name, wrap]
+        label, found = os.path.basename(name.replace("\\", "/")) or name, None
         try:
             content = read()
-            image = None if content is None else decode_image(content, label=label)
+            if content is None:
+                raise NPAError(f"{shown(label)} is not there: put it beside the file")
+            image = decode_image(content, label=label)
+            self._texels += image.width * image.height
+            if self._texels > _MAX_TEXELS:
+                raise NPAError(f"textures must have at most {_MAX_TEXELS} pixels: reduce them")
+            pixels = np.array(image)
+            lowest, highest = (float(f(pixels[..., 3])) / 255.0 for f in (np.min, np.max))
+            found = FileTexture(Texture(pixels[..., :3].copy(), wrap), lowest, highest)
         except NPAError as error:
-            self.left_out(f"a texture, as {error}")
-            return None
-        if image is None:
-            self.left_out(f"the texture {shown(label)}, which is not there: put it beside the file")
-            return None
-        self._texels += image.width * image.height
-        if self._texels > _MAX_TEXELS:
-            raise self.error(f"must have textures of at most {_MAX_TEXELS} pixels: reduce them")
-        pixels = np.array(image)
-        lowest, highest = (float(f(pixels[..., 3])) / 255.0 for f in (np.min, np.max))
-        return FileTexture(Texture(pixels[..., :3].copy(), wrap), lowest, highest)
+            self.left_out(f"a texture: {error}")
+        self._textures[name, wrap] = found
+        return found
 
     def polygons(
-        self,
-        vertices: FloatArray,
-        corners: IntArray,
-        counts: IntArray,
-        points: FloatArray | None = None,
+        self, vertices: FloatArray, corners: IntArray, counts: IntArray
     ) -> tuple[IntArray, IntArray]:
-        """Return polygons as triangles, see `triangulated`: places in `corners`, and polygons.
+        """Return polygons as triangles of places in `corners`, and the polygon of each.
 
-        `corners` are vertex indices of polygons, one after another.
+        `corners` are the vertex indices of all polygons, `counts` their numbers of corners.
         """
         self.check_corners(vertices, corners)
-        self.count_left_out(
-            int((counts < 3).sum()),
-            "face of fewer than three corners",
-            "faces of fewer corners than three",
-        )
+        few = "face{} with fewer than three corners"
+        self.count_left_out(int((counts < 3).sum()), few.format(""), few.format("s"))
         try:
             return triangulated(vertices[corners], counts)
         except NPAError as error:
             raise self.error(str(error)) from error
 
-    def check_corners(self, vertices: FloatArray, corners: IntArray) -> None:
+    def check_corners(self, vertices: NDArray[Any], corners: IntArray) -> None:
         """Raise NPAError unless indices are ones of vertices, and these are finite."""
-        if not corners.size:
-            return
-        if corners.min() < 0 or corners.max() >= len(vertices):
+        lowest, highest = corners.min(initial=0), corners.max(initial=-1)
+        if lowest < 0 or highest >= len(vertices):
             raise NPAError(
                 f"the triangles of target {shown(str(self.path))} must have corners from 0 to "
-                f"{len(vertices) - 1}, got {corners.min()} to {corners.max()}: save it again"
+                f"{len(vertices) - 1}, got {corners.min()} to {highest}: save it again"
             )
         if not np.isfinite(vertices[corners]).all():
             raise self.error("must hold triangles with finite corners, got others: save it again")
@@ -171,7 +157,7 @@ def unit_colours(values: NDArray[np.generic]) -> FloatArray:
     Whole numbers go to 255, or to 65535 where some are above that. So do others if some are above
     2, as float colours are written both ways (case colours_of_vertices_and_faces).
     """
-    top = float(values.max(initial=0))
+    top = float(np.nan_to_num(values.astype(np.float64)).max(initial=0.0))
     whole = values.dtype.kind in "iu"
     scale = 65535.0 if top > 255.0 else 255.0 if whole or top > 2.0 else 1.0
     return (values.astype(np.float64) / scale).clip(0.0, 1.0)

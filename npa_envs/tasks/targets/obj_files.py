@@ -1,6 +1,6 @@
 """Mesh files of Wavefront: OBJ, and the materials in MTL.
 
-trimesh counts negative indices from the end of the whole file (case
+trimesh counts negative indices from the end of the file (case
 obj_relative_indices_between_vertices), cuts polygons as if they were convex, and fails with texture
 coordinates but no texture (case mesh_one_plain_material).
 """
@@ -10,89 +10,107 @@ from __future__ import annotations
 import math
 import re
 from collections import Counter
-from dataclasses import dataclass, field
 
 import numpy as np
 
 from npa_envs.errors import shown
 from npa_envs.tasks.targets.mesh_parts import MeshFile, Part, unit_colours
-from npa_envs.tasks.targets.meshes import FloatArray, Wrap
+from npa_envs.tasks.targets.meshes import FloatArray
 
-_NOT_DRAWN = {
-    "p": ("element of points", "elements of points"),
-    "l": ("element of lines", "elements of lines"),
-    "curv": ("free-form curve", "free-form curves"),
-    "surf": ("free-form surface", "free-form surfaces"),
-}
+_NOT_DRAWN = {"p": "element(s) of points", "l": "element(s) of lines", "curv": "free-form curve(s)"}
+_NOT_DRAWN["surf"] = "free-form surface(s)"
+_OPTIONS = re.compile(r"(-\S+\s+((on|off|[rgbmlz]|[-+]?[.\d]\S*)\s+)*)*", re.IGNORECASE)
+"""The options before the file of a texture."""
 
 
-@dataclass
-class Material:
-    """What an MTL file says of the colour of a material."""
-
-    colour: list[float] = field(default_factory=list)
-    """Red, green and blue of `Kd`, sRGB in [0, 1]; empty if it is not given."""
-    emitted: list[float] = field(default_factory=list)
-    """Those of `Ke`."""
-    picture: str = ""
-    """The file of `map_Kd`; empty if there is none."""
-    wrap: Wrap = "repeat"
-    scale: tuple[float, float] = (1.0, 1.0)
-    """Texture coordinates are multiplied by this first."""
-    offset: tuple[float, float] = (0.0, 0.0)
-    """Then this is added to them."""
-    transparent: bool = False
-
-
-@dataclass
-class Rows:
+class _Rows:
     """What the lines of an OBJ file hold."""
 
-    vertices: list[list[float]] = field(default_factory=list)
-    colours: list[list[float]] = field(default_factory=list)
-    """Red, green and blue of each vertex; NaN: none."""
-    uv: list[list[float]] = field(default_factory=list)
-    corners: list[int] = field(default_factory=list)
-    """Vertex indices of the corners of all polygons."""
-    places: list[int] = field(default_factory=list)
-    """Index in `uv` of each of these corners, -1 for none."""
-    counts: list[int] = field(default_factory=list)
-    """Number of corners of each polygon."""
-    materials: list[int] = field(default_factory=list)
-    """Index in `names` of each polygon's material."""
-    names: dict[str, int] = field(default_factory=lambda: {"": 0})
-    material: int = 0
-    """The index of the polygons that follow."""
-    libraries: list[str] = field(default_factory=list)
-    not_drawn: Counter[str] = field(default_factory=Counter)
+    def __init__(self) -> None:
+        self.vertices: list[list[float]] = []
+        self.colours: list[list[float]] = []
+        """Red, green and blue of each vertex; NaN: none."""
+        self.uv: list[list[float]] = []
+        self.corners: list[int] = []
+        """Vertex indices of the corners of all polygons."""
+        self.places: list[int] = []
+        """Index in `uv` of each of these corners, -1 for none."""
+        self.counts: list[int] = []
+        """Number of corners of each polygon."""
+        self.materials: list[int] = []
+        """Index in `names` of each polygon's material."""
+        self.names: dict[str, int] = {"": 0}
+        self.material = 0
+        self.libraries: list[str] = []
+        self.not_drawn: Counter[str] = Counter()
+
+    def read_line(self, words: list[str]) -> None:
+        """Add what one line holds."""
+        word = words[0]
+        if word == "v":
+            row = [float(each) for each in words[1:]]
+            # Four numbers are homogeneous coordinates, six or more have a colour.
+            scale = row[3] if len(row) == 4 and row[3] else 1.0
+            self.vertices.append([row[0] / scale, row[1] / scale, row[2] / scale])
+            self.colours.append(row[3:6] if len(row) >= 6 else [math.nan] * 3)
+        elif word == "vt":
+            self.uv.append([float(words[1]), float(words[2]) if len(words) > 2 else 0.0])
+        elif word in ("f", "fo"):
+            for corner in words[1:]:
+                vertex, uv, *_ = [*corner.split("/"), ""]
+                self.corners.append(_index(vertex, len(self.vertices)))
+                self.places.append(_index(uv, len(self.uv)) if uv else -1)
+            self.counts.append(len(words) - 1)
+            self.materials.append(self.material)
+        elif word == "usemtl":
+            self.material = self.names.setdefault(" ".join(words[1:]), len(self.names))
+        elif word == "mtllib":
+            self.libraries.append(" ".join(words[1:]))
+        elif word in _NOT_DRAWN:
+            self.not_drawn[word] += 1
+
+
+def _index(text: str, count: int) -> int:
+    """Return an index from 0; negative ones count back from the last row before the line."""
+    index = int(text)
+    if index == 0 or index < -count:
+        raise ValueError(f"index {index} after {count} rows")
+    return index - 1 if index > 0 else count + index
+
+
+def _lines(content: bytes) -> list[list[str]]:
+    """Return the words of the lines of a text, without comments; continued lines are joined."""
+    code = "utf-16" if content[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig"
+    text = re.sub(r"\r\n?", "\n", content.decode(code, errors="replace")).replace("\\\n", " ")
+    lines = (re.sub(r"(^|\s)#.*", "", row) if "#" in row else row for row in text.split("\n"))
+    return [line.split() for line in lines]
 
 
 def read_obj(file: MeshFile, content: bytes) -> list[Part]:
     """Return the parts of an OBJ file, one for each material."""
-    rows = Rows()
+    rows = _Rows()
     for number, words in enumerate(_lines(content), 1):
         try:
-            _read_line(rows, words)
+            if words:
+                rows.read_line(words)
         except (ValueError, IndexError) as error:
-            raise file.error(
-                f"has a line that cannot be read, {number}: {shown(' '.join(words))} ({error}): "
-                "save it again"
-            ) from error
-    for word, (one, more) in _NOT_DRAWN.items():
-        file.count_left_out(rows.not_drawn[word], one, more)
-    vertices = np.array(rows.vertices, dtype=np.float64).reshape(-1, 3)
+            line = f"line {number}, {shown(' '.join(words))}"
+            raise file.error(f"has an unreadable {line} ({error}): save it again") from error
+    for word, things in _NOT_DRAWN.items():
+        file.count_left_out(rows.not_drawn[word], *(things.replace("(s)", s) for s in ("", "s")))
+    vertices, shades = (
+        np.array(each, dtype=np.float64).reshape(-1, 3) for each in (rows.vertices, rows.colours)
+    )
     corners, uv_indices, counts, of_polygons = (
         np.array(each, dtype=np.int64)
         for each in (rows.corners, rows.places, rows.counts, rows.materials)
     )
-    if uv_indices.size and not -1 <= uv_indices.min() <= uv_indices.max() < len(rows.uv):
+    if uv_indices.max(initial=-1) >= len(rows.uv):
         raise file.error(
-            f"must have indices of texture coordinates from 1 to {len(rows.uv)}, got others: save "
-            "it again"
+            f"has more texture coordinates in faces than its {len(rows.uv)} rows of vt"
         )
     places, polygons = file.polygons(vertices, corners, counts)
-    faces, of_faces = corners[places], of_polygons[polygons]
-    shades = unit_colours(np.array(rows.colours, dtype=np.float64).reshape(-1, 3))
+    faces, of_faces, shades = corners[places], of_polygons[polygons], unit_colours(shades)
     uv = np.array([*rows.uv, [np.nan] * 2], dtype=np.float64)
     materials = _read_materials(file, rows.libraries)
     parts = []
@@ -109,122 +127,58 @@ def read_obj(file: MeshFile, content: bytes) -> list[Part]:
     return parts
 
 
-def _lines(content: bytes) -> list[list[str]]:
-    """Return the words of each line of a text, without comments; long lines are joined."""
-    code = "utf-16" if content[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig"
-    text = content.decode(code, errors="replace").replace("\r\n", "\n").replace("\r", "\n")
-    lines = text.replace("\\\n", " ").split("\n")
-    return [(re.sub(r"(^|\s)#.*", "", row) if "#" in row else row).split() for row in lines]
+def _read_materials(file: MeshFile, libraries: list[str]) -> dict[str, dict[str, list[str]]]:
+    """Return the words of each property of the materials in the MTL files of an OBJ file."""
+    materials: dict[str, dict[str, list[str]]] = {}
+    for library in dict.fromkeys(libraries):
+        # A line may name one file with spaces, or several files.
+        for name in [library] if file.neighbour(library) is not None else library.split():
+            content, material = file.neighbour(name), {}
+            if content is None:
+                file.left_out(f"the materials of {shown(name)}, which is not there")
+            for words in filter(None, _lines(content or b"")):
+                if words[0] == "newmtl":
+                    material = materials.setdefault(" ".join(words[1:]), {})
+                else:
+                    material[words[0].lower()] = words[1:]
+    return materials
 
 
-def _read_line(rows: Rows, words: list[str]) -> None:
-    """Add what one line holds."""
-    word = words[0] if words else ""
-    if word == "v":
-        row = [float(each) for each in words[1:]]
-        # Four numbers are homogeneous coordinates, six or more have a colour.
-        scale = row[3] if len(row) == 4 and row[3] else 1.0
-        rows.vertices.append([row[0] / scale, row[1] / scale, row[2] / scale])
-        rows.colours.append(row[3:6] if len(row) >= 6 else [math.nan] * 3)
-    elif word == "vt":
-        rows.uv.append([float(words[1]), float(words[2]) if len(words) > 2 else 0.0])
-    elif word in ("f", "fo"):
-        for corner in words[1:]:
-            vertex, uv, *_ = [*corner.split("/"), ""]
-            rows.corners.append(_index(vertex, len(rows.vertices)))
-            rows.places.append(_index(uv, len(rows.uv)) if uv else -1)
-        rows.counts.append(len(words) - 1)
-        rows.materials.append(rows.material)
-    elif word == "usemtl":
-        rows.material = rows.names.setdefault(" ".join(words[1:]), len(rows.names))
-    elif word == "mtllib":
-        rows.libraries.append(" ".join(words[1:]))
-    elif word in _NOT_DRAWN:
-        rows.not_drawn[word] += 1
-
-
-def _index(text: str, count: int) -> int:
-    """Return an index from 0; negative ones are counted back from the last row before the line."""
-    index = int(text)
-    if index == 0 or index < -count:
-        raise ValueError(f"index {index} of {count} rows")
-    return index - 1 if index > 0 else count + index
-
-
-def _apply(file: MeshFile, material: Material, part: Part, uv: FloatArray) -> None:
+def _apply(file: MeshFile, material: dict[str, list[str]], part: Part, uv: FloatArray) -> None:
     """Give the colour and texture of its material to a part with these texture coordinates."""
-    colour, texture = material.colour, None
-    if material.picture:
-        name, wrap = material.picture, material.wrap
-        texture = file.texture(name, lambda: file.neighbour(name), (wrap, wrap))
-    transparent = material.transparent
-    if not any(colour) and any(material.emitted):
-        file.left_out("light: what a black material emits is read as its colour")
-        colour = material.emitted
+    try:
+        # One number stands for all three.
+        colour, light = (
+            [min(max(float(word), 0.0), 1.0) for word in (3 * material.get(key, []))[:3]]
+            for key in ("kd", "ke")
+        )
+        alpha = [
+            float(words[-1]) - k
+            for k, words in ((1, material.get("d")), (0, material.get("tr")))
+            if words
+        ]
+    except ValueError:
+        file.left_out("colours that are no numbers")
+        colour, light, alpha = [], [], []
+    texture, line = None, " ".join(material.get("map_kd", []))
+    name = _OPTIONS.sub("", line, count=1)
+    if name:
+        texture = file.texture(name, lambda: file.neighbour(name), ("repeat", "repeat"))
     if texture is not None:
-        transparent |= texture.lowest_alpha < 1.0
         part.texture = texture.texture
         # In this format v goes up.
-        part.uv = (uv * material.scale + material.offset) * (1.0, -1.0) + (0.0, 1.0)
+        part.uv = uv * (1.0, -1.0) + (0.0, 1.0)
+        if name != line:
+            file.left_out(f"options of the texture {shown(line)}")
         if np.isfinite(part.colours).any():
             file.left_out("colours of corners where there is a texture")
         if colour and not any(colour):
             file.left_out("black of a material with a texture, as it would hide that")
         part.colours = np.full(part.colours.shape, colour if any(colour) else 1.0)
     elif colour:
+        if any(light) and not any(colour):
+            file.left_out("light: what a black material emits is read as its colour")
+            colour = light
         part.colours = np.where(np.isnan(part.colours), colour, part.colours)
-    if transparent:
+    if any(alpha) or "map_d" in material or (texture is not None and texture.lowest_alpha < 1.0):
         file.left_out("transparency: all is opaque")
-
-
-def _read_materials(file: MeshFile, libraries: list[str]) -> dict[str, Material]:
-    """Return the materials in the MTL files that an OBJ file names."""
-    materials: dict[str, Material] = {}
-    for library in dict.fromkeys(libraries):
-        # A line may name one file with spaces, or several files.
-        for name in [library] if file.neighbour(library) is not None else library.split():
-            content = file.neighbour(name)
-            if content is None:
-                file.left_out(f"the materials of {shown(name)}, which is not there")
-                continue
-            material = Material()
-            for words in _lines(content):
-                if words[:1] == ["newmtl"]:
-                    material = materials.setdefault(" ".join(words[1:]), Material())
-                elif words:
-                    try:
-                        _read_property(material, words[0].lower(), words[1:])
-                    except (ValueError, IndexError):
-                        file.left_out(f"{shown(' '.join(words))} of {shown(name)}")
-    return materials
-
-
-def _read_property(material: Material, word: str, words: list[str]) -> None:
-    """Read a line of an MTL file."""
-    if word in ("kd", "ke"):
-        row = [min(max(float(each), 0.0), 1.0) for each in words[:3]]
-        row = row * 3 if len(row) == 1 else row
-        material.colour, material.emitted = (
-            (row, material.emitted) if word == "kd" else (material.colour, row)
-        )
-    elif word in ("d", "tr"):
-        material.transparent |= float(words[-1]) != (1.0 if word == "d" else 0.0)
-    elif word == "map_d":
-        material.transparent = True
-    elif word == "map_kd":
-        while words[0].startswith("-"):
-            option, words, numbers = words[0].lower(), words[1:], []
-            # The last numbers of an option may be left out.
-            while words and len(numbers) < {"-s": 3, "-o": 3, "-t": 3, "-mm": 2}.get(option, 0):
-                if not re.fullmatch(r"[-+]?[\d.]+(e[-+]?\d+)?", words[0], re.IGNORECASE):
-                    break
-                numbers.append(float(words.pop(0)))
-            if option == "-s":
-                material.scale = ([*numbers, 1.0][0], [*numbers, 1.0, 1.0][1])
-            elif option == "-o":
-                material.offset = ([*numbers, 0.0][0], [*numbers, 0.0, 0.0][1])
-            elif option not in ("-t", "-mm"):
-                value = words.pop(0).lower()
-                if option == "-clamp":
-                    material.wrap = "clamp" if value == "on" else "repeat"
-        material.picture = " ".join(words)
