@@ -15,7 +15,7 @@ from npa_envs.errors import NPAError, importing, shown
 from npa_envs.ops import Cameras, render_gaussians
 from npa_envs.tasks.gaussian_outputs import HARMONIC_0
 from npa_envs.tasks.targets.mesh_files import PlyProperty, ply_colours, read_ply
-from npa_envs.tasks.targets.mesh_parts import GREY, MeshFile
+from npa_envs.tasks.targets.mesh_parts import MeshFile
 from npa_envs.tasks.targets.meshes import MAX_FILE, RADIUS, FloatArray
 
 Element = dict[str, PlyProperty]
@@ -160,7 +160,7 @@ def _points(file: MeshFile, vertex: Element) -> Splats:
     colours = ply_colours(file, vertex)
     if colours is None:
         file.left_out("colours, as the file has none: all is grey")
-        colours = np.full(points.shape, GREY)
+        colours = np.full(points.shape, file.plain)
     finite = np.isfinite(points).all(axis=1)
     file.count_left_out(int((~finite).sum()), "point without a place", "points without a place")
     step = -(-len(points) // MAX_POINTS)
