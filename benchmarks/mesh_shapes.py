@@ -1,6 +1,6 @@
 """Coloured meshes made by formulas: the built-in ones of the package, and parts for others.
 
-`python benchmarks/mesh_shapes.py npa_envs/tasks/targets/mesh_files` writes the built-in files.
+`python benchmarks/mesh_shapes.py npa_envs/tasks/targets/built_in_meshes` writes the built-in files.
 """
 
 from __future__ import annotations
@@ -18,6 +18,18 @@ ROUND = 48
 """Corners around the axis of a surface of revolution."""
 
 
+def painted(vertices: FloatArray, faces: NDArray[np.int64], colours: FloatArray) -> Mesh:
+    """Return a mesh with a colour for each vertex, [K, 3]."""
+    return Mesh(vertices, faces, colours[faces])
+
+
+def vertex_colours(mesh: Mesh) -> FloatArray:
+    """Return the colour of each vertex of a mesh that `painted` made, [K, 3]."""
+    colours = np.zeros_like(mesh.vertices)
+    colours[mesh.faces] = mesh.colours
+    return colours
+
+
 def turned(
     profile: Sequence[tuple[float, float]],
     paint: Callable[[FloatArray], FloatArray],
@@ -30,7 +42,7 @@ def turned(
     z = rings[:, :1] * np.cos(angle)
     y = np.broadcast_to(rings[:, 1:], x.shape)
     vertices = np.stack((x, y, z), axis=-1).reshape(-1, 3)
-    return Mesh(vertices, grid_faces(len(rings), corners, closed=False), paint(vertices))
+    return painted(vertices, grid_faces(len(rings), corners, closed=False), paint(vertices))
 
 
 def ellipsoid(
@@ -139,7 +151,7 @@ def make_doughnut() -> Mesh:
         row, column = (11 * k) % (2 * ROUND), ROUND // 4 + (7 * k) % 15 - 7
         colours[row : row + 3, column - 1 : column + 1] = hues[k % 4]
     faces = grid_faces(2 * ROUND, ROUND, closed=True)
-    return Mesh(vertices.reshape(-1, 3), faces[:, ::-1].copy(), colours.reshape(-1, 3))
+    return painted(vertices.reshape(-1, 3), faces[:, ::-1].copy(), colours.reshape(-1, 3))
 
 
 def grid_faces(rows: int, columns: int, *, closed: bool) -> NDArray[np.int64]:
@@ -171,7 +183,7 @@ def _fin(outline: FloatArray, turn: float, thickness: float, colour: FloatArray)
         faces += [(start, start + 1, start + 2), (start, start + 2, start + 3)]
     corners = np.concatenate(vertices)
     colours = np.broadcast_to(colour, corners.shape).copy()
-    return Mesh(corners, np.array(faces, dtype=np.int64), colours)
+    return painted(corners, np.array(faces, dtype=np.int64), colours)
 
 
 MESHES: Mapping[str, Callable[[], Mesh]] = {
@@ -186,4 +198,4 @@ if __name__ == "__main__":
         mesh = make()
         faces = mesh.faces.astype(np.uint16)
         path = Path(sys.argv[1]) / f"{name}.npz"
-        np.savez_compressed(path, vertices=mesh.vertices, faces=faces, colours=mesh.colours)
+        np.savez_compressed(path, vertices=mesh.vertices, faces=faces, colours=vertex_colours(mesh))

@@ -24,7 +24,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from mesh_shapes import ellipsoid, grid_faces, joined, turned
+from mesh_shapes import ellipsoid, grid_faces, joined, painted, turned, vertex_colours
 from PIL import Image
 from side_by_side import iterate_together, on, stream_of
 from torch import Tensor
@@ -194,7 +194,7 @@ def make_knot() -> Mesh:
     hue = 0.5 + 0.45 * np.cos(t - np.array([[0.0, 2.1, 4.2]]))
     ringed = np.where(np.sin(18.0 * t) > 0.6, 0.95, hue)
     colours = np.repeat(ringed, len(around), axis=0)
-    return Mesh(vertices, grid_faces(len(t), len(around), closed=True), colours)
+    return painted(vertices, grid_faces(len(t), len(around), closed=True), colours)
 
 
 def make_fish() -> Mesh:
@@ -242,7 +242,7 @@ UNSEEN: Mapping[str, Callable[[], Mesh]] = {"fish": make_fish, "knot": make_knot
 
 def ply(mesh: Mesh) -> str:
     """Return a mesh as a PLY file's text, with a colour at each corner."""
-    shades: FloatArray = (255.0 * mesh.colours.clip(0.0, 1.0)).round()
+    shades: FloatArray = (255.0 * vertex_colours(mesh).clip(0.0, 1.0)).round()
     lines = ["ply", "format ascii 1.0", f"element vertex {len(mesh.vertices)}"]
     lines += [f"property float {axis}" for axis in "xyz"]
     lines += [f"property uchar {channel}" for channel in ("red", "green", "blue")]
@@ -451,7 +451,7 @@ def particles(arguments: argparse.Namespace) -> None:
 def surface(mesh: Mesh, count: int) -> tuple[Tensor, Tensor]:
     """Return points spread evenly over a mesh [length units] and their colours, [count, 3] each."""
     random = np.random.default_rng(0)
-    corners, shades = mesh.vertices[mesh.faces], mesh.colours[mesh.faces]
+    corners, shades = mesh.vertices[mesh.faces], mesh.colours
     sides = corners[:, 1:] - corners[:, :1]
     area = np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1)
     face = random.choice(len(area), count, p=area / area.sum())

@@ -172,7 +172,9 @@ def _warm_views(x: torch.Tensor) -> None:
     corners = torch.zeros(3, 3, dtype=torch.float64, device="cpu")
     faces = torch.arange(3, device="cpu")[None]
     seen = faces[:, :1] == 0
-    nearest_triangles(corners[None, :, :2], corners[:1], corners, faces, seen, width=1, height=1)
+    nearest_triangles(
+        corners[None, :, :2], corners[:1], corners[faces], faces, seen, width=1, height=1
+    )
 
 
 def _pull_back(value: torch.Tensor) -> None:

@@ -22,7 +22,7 @@ def brute_force(place, nearness, colours, faces, seen, width, height):
                     share = share * nearness[camera, corners]
                     if share.sum() > nearest[row, column]:
                         nearest[row, column] = share.sum()
-                        picture[camera, row, column, :3] = share @ colours[corners] / share.sum()
+                        picture[camera, row, column, :3] = share @ colours[face] / share.sum()
                         picture[camera, row, column, 3] = 1.0
     return picture
 
@@ -44,7 +44,7 @@ def random_triangles(width, height):
     seen = torch.ones(5, 6, dtype=torch.bool)
     seen[1, 5] = False
     faces = torch.arange(18).view(6, 3)
-    return place, nearness, drawn(18, 3), faces, seen
+    return place, nearness, drawn(6, 3, 3), faces, seen
 
 
 def test_each_pixel_shows_the_nearest_triangle():
@@ -57,7 +57,7 @@ def test_each_pixel_shows_the_nearest_triangle():
     # Turned round, a triangle looks the same.
     place, nearness, colours, faces, seen = arguments
     again = nearest_triangles(
-        place, nearness, colours, faces.flip(1), seen, width=width, height=height
+        place, nearness, colours.flip(1), faces.flip(1), seen, width=width, height=height
     )
     torch.testing.assert_close(again, results, rtol=1e-9, atol=1e-9)
 

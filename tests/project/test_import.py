@@ -137,8 +137,8 @@ def wrapper(module, name):
 )
 def test_a_missing_library_is_named_with_its_hint(library, hint, call, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, library, None)
-    film, mesh = tmp_path / "film.mp4", tmp_path / "mesh.glb"
-    mesh.touch()
+    film, mesh = tmp_path / "film.mp4", tmp_path / "mesh.stl"
+    mesh.write_text("solid", encoding="utf-8")
     with pytest.raises(MissingDependencyError, match=hint):
         call(film if library == "imageio_ffmpeg" else mesh)
     assert not film.exists()

@@ -57,7 +57,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_wheel_holds_every_source_file_the_rules_and_the_license(site: Path) -> None:
     sources = [p for kind in ("*.py", "*.cuh") for p in (ROOT / "npa_envs").rglob(kind)]
-    targets = ("tasks/targets/drawings", "tasks/targets/mesh_files")
+    targets = ("tasks/targets/drawings", "tasks/targets/built_in_meshes")
     for folder in ("rule/shipped", "rule/initial", *targets, "web/page"):
         sources += (ROOT / "npa_envs" / folder).glob("*.*")
     kinds = ("*.py", "*.schema.json")

@@ -90,8 +90,8 @@ def under_the_surface(count, depth):
     x = a[chosen] + u * (b - a)[chosen] + v * (c - a)[chosen]
     x -= depth * (outward / area)[chosen]
     light = (mesh.normals() @ (np.array(LIGHT) / np.linalg.norm(LIGHT))).clip(0)
-    lit = mesh.colours * (AMBIENT + (1 - AMBIENT) * light)[:, None]
-    colours = lit[mesh.faces[chosen, 0]]
+    lit = mesh.colours[:, 0] * (AMBIENT + (1 - AMBIENT) * light[mesh.faces[:, 0]])[:, None]
+    colours = lit[chosen]
     return [torch.tensor(t, dtype=torch.float32)[None] for t in (x, colours)]
 
 

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import contextlib
 import io
 import math
 import os
 import warnings
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import EpsImagePlugin, Image, UnidentifiedImageError, features
+from PIL import Image, UnidentifiedImageError, features
 
 from npa_envs.atomic_files import read_bytes
 from npa_envs.errors import MissingDependencyError, NPAError, importing, shown
@@ -21,7 +19,9 @@ from npa_envs.tasks.targets.picture_modes import Mask, correct_tiles, kind_of_ti
 OPAQUE = 128
 """Minimum alpha of a pixel that belongs to a target, out of 255."""
 
-_BACKGROUND_TOLERANCE = 28  # of 255, in each of red, green and blue
+BACKGROUND_TOLERANCE = 28
+"""How far a background's red, green and blue may be from its colour, out of 255."""
+
 _UNIFORM = 0.95  # of the border's pixels
 _MAX_CUT_OUT = 2048  # pixels on each side
 _MAX_FILE = 256 * 2**20  # bytes
@@ -89,8 +89,12 @@ def with_background(image: Image.Image) -> Image.Image:
 
 def open_image(path: Path) -> Image.Image:
     """Read a picture as RGBA, as it is."""
-    name = shown(str(path))
-    content = read_bytes(path, limit=_MAX_FILE, what="target")
+    return decode_image(read_bytes(path, limit=_MAX_FILE, what="target"), label=str(path))
+
+
+def decode_image(content: bytes, *, label: str) -> Image.Image:
+    """Return the picture in the bytes of a file as RGBA, as it is; errors call it `label`."""
+    name = shown(label)
     if not content:
         raise NPAError(f"target {name} is an empty file (0 bytes): save the picture again")
     try:
@@ -102,7 +106,7 @@ def open_image(path: Path) -> Image.Image:
                 opened.load()
                 # A format inside of another may have another size.
                 _check_area(opened.size, name)
-                return to_rgba(opened, content, str(path))
+                return to_rgba(opened, content, label)
     except Image.DecompressionBombError as error:
         raise _too_large(name, "more") from error
     except UnidentifiedImageError as error:
@@ -146,17 +150,6 @@ def _formats(content: bytes, name: str) -> tuple[str, ...]:
         import pillow_heif
     pillow_heif.register_heif_opener()
     return (*FORMATS, "HEIF")
-
-
-@contextlib.contextmanager
-def no_foreign_programs() -> Iterator[None]:
-    """Return a context in which Pillow runs no Ghostscript, whichever library calls Pillow."""
-    before = EpsImagePlugin.gs_binary
-    EpsImagePlugin.gs_binary = False
-    try:
-        yield
-    finally:
-        EpsImagePlugin.gs_binary = before
 
 
 def _check_area(size: tuple[int, int], name: str) -> None:
@@ -208,7 +201,7 @@ def cut_out_background(image: Image.Image, *, label: str) -> Image.Image:
     rgb = np.asarray(image.convert("RGB")).astype(np.float32)
     border = np.concatenate([rgb[0], rgb[-1], rgb[:, 0], rgb[:, -1]])
     background = np.median(border, axis=0)
-    uniform = (np.abs(border - background).max(axis=-1) <= _BACKGROUND_TOLERANCE).mean()
+    uniform = (np.abs(border - background).max(axis=-1) <= BACKGROUND_TOLERANCE).mean()
     if uniform < _UNIFORM:
         raise NPAError(
             f"target {shown(label)} is opaque, so at least {_UNIFORM:.0%} of its border must have "
@@ -216,20 +209,25 @@ def cut_out_background(image: Image.Image, *, label: str) -> Image.Image:
             "out: --keep-background grows the whole rectangle (in Python keep_background=True), "
             "or give a PNG or WebP with a transparent background"
         )
-    similar = np.abs(rgb - background).max(axis=-1) <= _BACKGROUND_TOLERANCE
-    outside = _connected_to_border(similar)
-    if outside.all():
+    cut = cut_out(image, background)
+    if cut.getextrema()[3] == (0, 0):
         raise NPAError(
             f"target {shown(label)} is opaque and of one colour all over, nothing to grow: give a "
             "picture with an object, best a PNG with a transparent background; --keep-background "
             "grows the whole rectangle (in Python keep_background=True)"
         )
-    colour, alpha = _unmix_edge(rgb, ~outside, background)
-    alpha = np.minimum(255 * alpha, np.asarray(image.getchannel("A")))
-    pixels = np.concatenate([colour, alpha[..., None]], axis=-1)
-    cut = Image.fromarray(pixels.round().clip(0, 255).astype(np.uint8), "RGBA")
     require_opaque_pixels(cut, label=label)
     return cut
+
+
+def cut_out(image: Image.Image, background: FloatImage) -> Image.Image:
+    """Return a picture with the `background`, a colour [3], made transparent next to its border."""
+    rgb = np.asarray(image.convert("RGB")).astype(np.float32)
+    similar = np.abs(rgb - background).max(axis=-1) <= BACKGROUND_TOLERANCE
+    colour, alpha = _unmix_edge(rgb, ~_connected_to_border(similar), background)
+    alpha = np.minimum(255 * alpha, np.asarray(image.getchannel("A")))
+    pixels = np.concatenate([colour, alpha[..., None]], axis=-1)
+    return Image.fromarray(pixels.round().clip(0, 255).astype(np.uint8), "RGBA")
 
 
 def resample(image: Image.Image, point_count: int, *, label: str = "picture") -> Image.Image:

@@ -2,49 +2,72 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any, Literal
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from npa_envs.atomic_files import home_path, open_regular
-from npa_envs.errors import MissingDependencyError, NPAError, shown, suggest
+from npa_envs.atomic_files import home_path
+from npa_envs.errors import NPAError, shown, suggest
 from npa_envs.ops import Cameras
-from npa_envs.ops.pictures.triangles import nearest_triangles
-from npa_envs.tasks.targets.images import no_foreign_programs
+from npa_envs.ops.pictures.triangles import WRAP_NUMBERS, TexturedFaces, nearest_triangles
 
 FloatArray = NDArray[np.float64]
 
 RADIUS = 0.85
 """Radius of the ball around the origin into which every mesh is scaled [length units]."""
 
-_MAX_FILE = 256 * 2**20
-_SIZE_RANGE = 1e-30, 1e30
-_MIN_AREA = 1e-12
+MAX_FILE = 256 * 2**20
+"""Maximum size of a mesh file, and of each file that it names [bytes]."""
 
 MESH_SUFFIXES = (".glb", ".gltf", ".obj", ".off", ".ply", ".stl")
 """Suffixes of mesh files."""
 
 
+Wrap = Literal["repeat", "mirror", "clamp"]
+"""What a texture shows beyond its edges: itself again, itself mirrored, or its edge."""
+
+
+@dataclass(frozen=True, eq=False)
+class Texture:
+    """A picture that lies on triangles."""
+
+    pixels: NDArray[np.uint8]
+    """Red, green and blue, sRGB, in [0, 255], shape [H, W, 3]; the first row is the upper one."""
+    wrap: tuple[Wrap, Wrap] = ("repeat", "repeat")
+    """What it shows beyond its left and right edges (u), and beyond upper and lower ones (v)."""
+
+
 @dataclass(frozen=True, eq=False)
 class Mesh:
-    """Triangles with colours at their vertices; y is up."""
+    """Triangles with colours or textures; y is up."""
 
     vertices: FloatArray
     """Vertices [length units], shape [K, 3]."""
     faces: NDArray[np.int64]
     """Vertex indices of each triangle, counterclockwise from outside, shape [F, 3]."""
     colours: FloatArray
-    """Red, green and blue of each vertex, in [0, 1], shape [K, 3]."""
+    """Red, green and blue at each corner of each triangle, sRGB, in [0, 1], shape [F, 3, 3]. On a
+    triangle with a texture they multiply the texture in linear light: white leaves it as it is."""
+    uv: FloatArray | None = None
+    """Place in the texture of each corner of each triangle, shape [F, 3, 2]: (0, 0) is the upper
+    left corner of the picture, and (1, 1) the lower right one. None: no triangle has a texture."""
+    texture_of_face: NDArray[np.int64] | None = None
+    """Index of each triangle's texture, -1 for none, shape [F]. None: none has one."""
+    textures: tuple[Texture, ...] = ()
+    """The textures."""
+    summary: str = ""
+    """What was read, in one line."""
 
     def fitted(self, radius: float = RADIUS) -> Mesh:
         """Return the mesh with its bounding box centred at 0, scaled into a ball of `radius`."""
         used = self.vertices[np.unique(self.faces)]
         middle = 0.5 * (used.min(axis=0) + used.max(axis=0))
         farthest = np.linalg.norm(used - middle, axis=1).max()
-        return Mesh((self.vertices - middle) * (radius / farthest), self.faces, self.colours)
+        return replace(self, vertices=(self.vertices - middle) * (radius / farthest))
 
     def normals(self) -> FloatArray:
         """Return unit normals at vertices, means over triangles weighted by area, shape [K, 3]."""
@@ -58,7 +81,7 @@ class Mesh:
         return unit
 
 
-MESHES = {path.stem: path for path in (Path(__file__).parent / "mesh_files").glob("*.npz")}
+MESHES = {path.stem: path for path in (Path(__file__).parent / "built_in_meshes").glob("*.npz")}
 """The files of the built-in meshes by name; `benchmarks/mesh_shapes.py` makes them."""
 
 
@@ -71,71 +94,18 @@ def load_mesh(source: str | Path) -> Mesh:
     """Return a built-in mesh, by name, or the mesh in a file, scaled into a ball of radius 0.85."""
     if isinstance(source, str) and source in MESHES:
         with np.load(MESHES[source]) as file:
-            return Mesh(file["vertices"], file["faces"].astype(np.int64), file["colours"]).fitted()
+            faces = file["faces"].astype(np.int64)
+            return Mesh(file["vertices"], faces, file["colours"][faces]).fitted()
     path = home_path(source)
     if path.suffix.lower() not in MESH_SUFFIXES:
         raise NPAError(
             f"target must be a built-in mesh, the path of a mesh file ({', '.join(MESH_SUFFIXES)}) "
             f"or a folder of views, got {shown(str(source))}: {suggest(source, MESHES)}"
         )
-    open_regular(path, limit=_MAX_FILE, what="target").close()
-    return _read_mesh(path).fitted()
+    # The readers make meshes.
+    from npa_envs.tasks.targets.mesh_files import read_mesh
 
-
-def _read_mesh(path: Path) -> Mesh:
-    """Return the mesh in a file, as large as there; grey where the file has no colours."""
-    try:
-        import trimesh
-    except ImportError as error:
-        raise MissingDependencyError(
-            f"reading the mesh {shown(str(path))} needs trimesh, which is not installed: "
-            "pip install 'npa-envs[meshes]', or take a built-in mesh"
-        ) from error
-    try:
-        with no_foreign_programs(), np.errstate(all="ignore"):
-            read = trimesh.load(path, force="mesh", process=False)
-            vertices = np.asarray(read.vertices, dtype=np.float64)
-            faces = np.asarray(read.faces, dtype=np.int64)
-            visual = read.visual.to_color() if hasattr(read.visual, "to_color") else read.visual
-            colours = np.asarray(visual.vertex_colors, dtype=np.float64)[:, :3] / 255.0
-    except Exception as error:
-        # Its readers report damaged files by exceptions of many kinds.
-        raise NPAError(
-            f"target {shown(str(path))} cannot be read as a mesh ({type(error).__name__}: "
-            f"{shown(error)}): save it again, for example as .ply or .glb"
-        ) from error
-    _check_triangles(vertices, faces, path)
-    if colours.shape != vertices.shape or not np.isfinite(colours).all():
-        colours = np.full(vertices.shape, 0.6)
-    return Mesh(vertices, faces, colours)
-
-
-def _check_triangles(vertices: FloatArray, faces: NDArray[np.int64], path: Path) -> None:
-    """Raise NPAError unless a file's triangles exist, are finite, of a usual size, and not flat."""
-    in_space = vertices.shape[1:] == (3,) and faces.shape[1:] == (3,)
-    if not in_space or faces.size == 0 or vertices.size == 0 or not np.isfinite(vertices).all():
-        raise NPAError(
-            f"target {shown(str(path))} must hold triangles with finite corners, got {len(faces)} "
-            f"triangles and {len(vertices)} corners: give a surface, not a point cloud"
-        )
-    if faces.min() < 0 or faces.max() >= len(vertices):
-        raise NPAError(
-            f"the triangles of target {shown(str(path))} must have corners from 0 to "
-            f"{len(vertices) - 1}, got {faces.min()} to {faces.max()}: save it again"
-        )
-    used = vertices[np.unique(faces)]
-    size = float((used.max(axis=0) / 2 - used.min(axis=0) / 2).max()) * 2
-    if not _SIZE_RANGE[0] <= size <= _SIZE_RANGE[1] or np.abs(used).max() > _SIZE_RANGE[1]:
-        raise NPAError(
-            f"target {shown(str(path))} must lie within {_SIZE_RANGE[1]:g} of the origin and be of "
-            f"a size of at least {_SIZE_RANGE[0]:g}, got a size of {size:.3g}: scale it"
-        )
-    a, b, c = ((vertices[faces[:, k]] - used.min(axis=0)) / size for k in range(3))
-    if np.linalg.norm(np.cross(b - a, c - a), axis=1).max() < _MIN_AREA:
-        raise NPAError(
-            f"target {shown(str(path))} must have a surface, but the corners of every triangle "
-            "lie on a line: give triangles with an area"
-        )
+    return read_mesh(path).fitted()
 
 
 # Pictures of meshes.
@@ -149,23 +119,106 @@ AMBIENT = 0.6
 SAMPLES = 2
 """Number of samples along each side of a pixel."""
 
+MAX_TEXELS, MAX_ALL_TEXELS = 2**24, 2**26
+"""Maximum number of pixels of a texture, 4096 x 4096, and of all textures of a mesh together: those
+with more are halved."""
+
 BATCH_LIMIT = 2**22
 """Maximum number of samples, and of vertices, of the views that are drawn in one batch; a single
 view may have more."""
 
 
+def linear_light(colours: FloatArray) -> FloatArray:
+    """Return the linear brightness of sRGB values in [0, 1]."""
+    bright: FloatArray = ((colours + 0.055).clip(0.0) / 1.055) ** 2.4
+    return np.where(colours <= 0.04045, colours / 12.92, bright)
+
+
+def srgb_values(brightness: NDArray[Any]) -> NDArray[Any]:
+    """Return the sRGB values in [0, 1] of linear brightnesses."""
+    bright = 1.055 * brightness.clip(0.0) ** (1.0 / 2.4) - 0.055
+    return np.where(brightness <= 0.0031308, 12.92 * brightness, bright)
+
+
+def halved(pixels: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Return an sRGB picture [H, W, 3] at half its size, averaged in linear light."""
+    channels = []
+    for k in range(3):
+        channel = _BRIGHTNESS.astype(np.float32)[pixels[..., k]]
+        half = _halved_rows(_halved_rows(channel).T).T
+        channels.append((255.0 * srgb_values(half)).round().clip(0, 255).astype(np.uint8))
+    return np.stack(channels, axis=-1)
+
+
+def _halved_rows(values: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return half as many rows, rounded down, each the mean over an equal part of the height."""
+    count, half = len(values), len(values) // 2
+    if count == 1:
+        return values
+    upper, lower = values[: 2 * half : 2], values[1 : 2 * half : 2]
+    if count == 2 * half:
+        return 0.5 * (upper + lower)
+    share = np.arange(1, half + 1, dtype=np.float32)[:, None] / np.float32(count)
+    mean: NDArray[np.float32] = upper * (half / count + 1.0 / count - share)
+    mean += lower * (half / count)
+    mean += values[2::2] * share
+    return mean
+
+
+_BRIGHTNESS = linear_light(np.arange(256) / 255.0)
+
+
+def _textured_faces(mesh: Mesh, light: FloatArray) -> TexturedFaces | None:
+    """Return a mesh's textures with all their levels; `light`: brightness of each corner."""
+    if mesh.texture_of_face is None or mesh.uv is None or (mesh.texture_of_face < 0).all():
+        return None
+    texels, headers, total = [], [], 0
+    for texture in mesh.textures:
+        pixels = texture.pixels
+        while pixels[..., 0].size > min(MAX_TEXELS, MAX_ALL_TEXELS // len(mesh.textures)):
+            pixels = halved(pixels)
+        header = []
+        while True:
+            header.append((total, pixels.shape[1], pixels.shape[0]))
+            texels.append(pixels.reshape(-1, 3))
+            total += len(texels[-1])
+            if pixels.shape[:2] == (1, 1):
+                break
+            pixels = halved(pixels)
+        headers.append(header)
+    depth = max(map(len, headers))
+    levels = [header + [(0, 0, 0)] * (depth - len(header)) for header in headers]
+    wrap = [[WRAP_NUMBERS[side] for side in texture.wrap] for texture in mesh.textures]
+    return TexturedFaces(
+        torch.from_numpy(np.concatenate(texels)),
+        torch.tensor(levels, dtype=torch.int32),
+        torch.tensor(wrap, dtype=torch.int32),
+        torch.from_numpy(_BRIGHTNESS),
+        torch.from_numpy(mesh.texture_of_face.astype(np.int32)),
+        torch.from_numpy(np.nan_to_num(mesh.uv).astype(np.float64, order="C").clip(-1e9, 1e9)),
+        torch.from_numpy(light),
+    )
+
+
 def draw_mesh(mesh: Mesh, cameras: Cameras) -> NDArray[np.float32]:
     """Return pictures of a mesh by V cameras, [V, H, W, 4]: colours times alpha, alpha, in [0, 1].
 
-    Surfaces are matt and lit from a direction fixed in the world. Both sides of triangles are
-    visible. Triangles with a vertex nearer than `cameras.near` are left out. The top row is first.
+    Surfaces are matt and lit from a direction fixed in the world. Textures finer than pixels are
+    averaged in linear light. Both sides of triangles are visible. Triangles with a vertex nearer
+    than `cameras.near` are left out. The top row is first.
     """
     light = np.asarray(LIGHT) / np.linalg.norm(LIGHT)
     lit = AMBIENT + (1.0 - AMBIENT) * (mesh.normals() @ light).clip(0.0, 1.0)
+    light = lit[mesh.faces]
+    colours_of_corners = mesh.colours * light[..., None]
+    textures = _textured_faces(mesh, light)
+    if textures is not None:
+        textured = textures.of_face.numpy() >= 0
+        colours_of_corners[textured] = linear_light(mesh.colours[textured])
     # Copies: torch accepts no arrays with negative strides or read-only ones.
     colours, vertices = (
         torch.from_numpy(np.array(values, dtype=np.float64, order="C"))
-        for values in (mesh.colours * lit[:, None], mesh.vertices)
+        for values in (colours_of_corners, mesh.vertices)
     )
     faces = torch.from_numpy(np.array(mesh.faces, dtype=np.int64, order="C"))
     motions = cameras.world_to_camera.double().cpu()
@@ -183,6 +236,7 @@ def draw_mesh(mesh: Mesh, cameras: Cameras) -> NDArray[np.float32]:
             colours,
             faces,
             (local[..., 2] >= cameras.near)[:, faces].all(dim=-1),
+            textures,
             width=width,
             height=height,
         )

@@ -1,0 +1,364 @@
+"""Mesh files as meshes with colours and textures; in this file PLY, OFF and STL."""
+
+from __future__ import annotations
+
+import functools
+import io
+import re
+import struct
+import warnings
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from npa_envs.atomic_files import read_bytes
+from npa_envs.errors import NPAError, importing, shown
+from npa_envs.tasks.targets.gltf_files import read_gltf
+from npa_envs.tasks.targets.mesh_parts import (
+    MAX_TRIANGLES,
+    IntArray,
+    MeshFile,
+    Part,
+    strip,
+    unit_colours,
+)
+from npa_envs.tasks.targets.meshes import MAX_FILE, FloatArray, Mesh
+from npa_envs.tasks.targets.obj_files import read_obj
+
+_MAX_UV = 1e6
+_SIZE_RANGE = 1e-30, 1e30
+_MIN_AREA = 1e-12
+
+
+def read_mesh(path: Path) -> Mesh:
+    """Return the mesh in a file, as large as there; grey where the file has no colours.
+
+    What is left out of it is told by `left_out`.
+    """
+    content = read_bytes(path, limit=MAX_FILE, what="target")
+    file = MeshFile(path)
+    if not content:
+        raise file.error("is an empty file (0 bytes): save the mesh again")
+    try:
+        with np.errstate(all="ignore"):
+            return _joined(file, _READERS[path.suffix.lower()](file, content))
+    except NPAError:
+        raise
+    except Exception as error:
+        # Damaged files raise exceptions of many kinds.
+        raise file.error(
+            f"cannot be read as a mesh ({type(error).__name__}: {shown(error)}): save it again, "
+            "for example as .ply or .glb"
+        ) from error
+
+
+def _joined(file: MeshFile, parts: list[Part]) -> Mesh:
+    """Return the mesh of a file's parts."""
+    sizes = [len(part.faces) for part in parts]
+    total = sum(sizes)
+    if not 0 < total <= MAX_TRIANGLES:
+        raise file.error(
+            f"must hold triangles, at most {MAX_TRIANGLES}, got {total}: give a surface, not a "
+            "point cloud"
+        )
+    shared = {id(part.vertices): part.vertices for part in parts}
+    vertices = np.concatenate(list(shared.values()))
+    ends = np.cumsum([len(each) for each in shared.values()])
+    starts = dict(zip(shared, [0, *ends.tolist()], strict=False))
+    faces = np.concatenate([part.faces + starts[id(part.vertices)] for part in parts])
+    file.check_corners(vertices, faces)
+    _check_size(file, vertices, faces)
+    textures = [part.texture for part in parts if part.texture is not None and len(part.faces)]
+    number = {texture: k for k, texture in enumerate(dict.fromkeys(textures))}
+    texture_of_face = np.repeat(
+        [-1 if p.texture is None else number.get(p.texture, -1) for p in parts], sizes
+    )
+    colours, uv = (np.concatenate([getattr(p, key) for p in parts]) for key in ("colours", "uv"))
+    lost = (texture_of_face >= 0) & ~np.isfinite(uv).all(axis=(1, 2))
+    what = "texture of {}, without coordinates in it"
+    file.count_left_out(int(lost.sum()), what.format("triangle"), what.format("triangles"))
+    texture_of_face[lost] = -1
+    colours[(texture_of_face >= 0)[:, None, None] & np.isnan(colours)] = 1.0
+    plain = ~np.isfinite(colours).all(axis=(1, 2))
+    colours[plain] = file.plain
+    if plain.any():
+        which = "the file has none" if plain.all() else f"{plain.sum()} triangles have none"
+        shade = "white" if file.plain == 1.0 else "grey"
+        file.left_out(f"colours, as {which}: {'all is' if plain.all() else 'they are'} {shade}")
+    looks = [f"{total} triangles"]
+    if number:
+        size = "texture {1} x {0}".format(*textures[0].pixels.shape)
+        looks.append(size if len(number) == 1 else f"{len(number)} textures")
+    if file.materials:
+        looks.append(f"{len(file.materials)} material" + "s" * (len(file.materials) > 1))
+    elif not number:
+        looks.append("no colours" if plain.all() else "colours of corners or faces")
+    summary = f"{file.path.name}: {', '.join(looks)}"
+    mesh = Mesh(vertices, faces, colours.clip(0.0, 1.0), summary=summary)
+    if number:
+        uv = np.nan_to_num(uv).clip(-_MAX_UV, _MAX_UV)
+        mesh = replace(mesh, uv=uv, texture_of_face=texture_of_face, textures=tuple(number))
+    return mesh
+
+
+def _check_size(file: MeshFile, vertices: FloatArray, faces: IntArray) -> None:
+    """Raise NPAError unless a file's triangles are of a usual size, and not all flat."""
+    used = vertices[np.unique(faces)]
+    size = float((used.max(axis=0) / 2 - used.min(axis=0) / 2).max()) * 2
+    if not _SIZE_RANGE[0] <= size <= _SIZE_RANGE[1] or np.abs(used).max() > _SIZE_RANGE[1]:
+        raise file.error(
+            f"must lie within {_SIZE_RANGE[1]:g} of the origin and be of a size of at least "
+            f"{_SIZE_RANGE[0]:g}, got a size of {size:.3g}: scale it"
+        )
+    a, b, c = ((vertices[faces[:, k]] - used.min(axis=0)) / size for k in range(3))
+    if np.linalg.norm(np.cross(b - a, c - a), axis=1).max() < _MIN_AREA:
+        raise file.error(
+            "must have a surface, but the corners of every triangle lie on a line: give triangles "
+            "with an area"
+        )
+
+
+# PLY. trimesh reads no lists of different lengths from bytes, cuts polygons as if they were convex,
+# and knows neither other names of colours nor polygons' own (case colours_of_vertices_and_faces).
+
+_PLY_TYPES = {
+    "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2",
+    "ushort": "u2", "uint16": "u2", "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4",
+    "int64": "i8", "uint64": "u8", "float16": "f2", "float": "f4", "float32": "f4",
+    "double": "f8", "float64": "f8",
+}  # fmt: skip
+
+
+class PlyProperty(NamedTuple):
+    """The values of one property in all rows of a PLY element."""
+
+    values: NDArray[Any]
+    """The values of all rows, one after another, of the type that the file declares."""
+    counts: IntArray
+    """The number of values of each row; other numbers than 1 if the property is a list."""
+
+
+def read_ply(content: bytes) -> tuple[dict[str, dict[str, PlyProperty]], list[str]]:
+    """Return the properties of each element of a PLY file, by their names, and its comments."""
+    end = re.search(rb"[\r\n]end_header[ \t]*(\r\n|\n|\r)", content)
+    if not content.startswith(b"ply") or end is None:
+        raise ValueError("it does not begin with ply and a whole header")
+    order, comments, data, position = "", [], content[end.end() :], 0
+    layout: list[tuple[str, int, list[tuple[str, str, str]]]] = []
+    for line in content[: end.start()].decode("latin-1").splitlines()[1:]:
+        word, *rest = line.split() or [""]
+        if word == "format":
+            order = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}[rest[0]]
+        elif word == "comment":
+            comments.append(" ".join(rest))
+        elif word == "element":
+            layout.append((rest[0], int(rest[1]), []))
+        elif word == "property":
+            counted, kind = rest[1:3] if rest[0] == "list" else ("", rest[0])
+            layout[-1][2].append((rest[-1], counted, kind))
+    if order == "=":
+        with warnings.catch_warnings():
+            # What is no number is a warning.
+            warnings.simplefilter("error")
+            data = np.fromstring(data.decode("latin-1"), dtype=np.float64, sep=" ").tobytes()
+    elements = {}
+    for name, count, properties in layout:
+        elements[name], position = _read_rows(data, position, count, properties, order)
+    return elements, comments
+
+
+def _read_rows(
+    data: bytes, start: int, count: int, properties: list[tuple[str, str, str]], order: str
+) -> tuple[dict[str, PlyProperty], int]:
+    """Return the rows of a PLY element, which begin at a byte, and the byte where they end.
+
+    Properties have a name, the type of a list's count or "", and a type. In the order "=" all are
+    stored as float64.
+    """
+
+    def stored(kind: str) -> np.dtype[Any]:
+        return np.dtype(np.float64 if order == "=" else order + _PLY_TYPES[kind])
+
+    declared = {key: _PLY_TYPES[kind] for key, _, kind in properties}
+    if not any(counted for _, counted, _ in properties):
+        fields = [(key, stored(kind)) for key, _, kind in properties]
+        rows = np.frombuffer(data, fields, count, start) if count else np.empty(0, fields)
+        ones = np.ones(count, dtype=np.int64)
+        return {
+            k: PlyProperty(rows[k].astype(declared[k]), ones) for k in declared
+        }, start + rows.nbytes
+    plan = [
+        (
+            struct.Struct(order + stored(counted).char.replace("l", "q")) if counted else None,
+            stored(kind),
+        )
+        for _, counted, kind in properties
+    ]
+    pieces: list[list[bytes]] = [[] for _ in plan]
+    counts: list[list[int]] = [[] for _ in plan]
+    for _ in range(count):
+        for k, (counter, kind_stored) in enumerate(plan):
+            length = 1
+            if counter is not None:
+                length = int(counter.unpack_from(data, start)[0])
+                start += counter.size
+            end = start + length * kind_stored.itemsize
+            if not start <= end <= len(data):
+                raise ValueError("it ends too early")
+            counts[k].append(length)
+            pieces[k].append(data[start:end])
+            start = end
+    found = {}
+    for k, (key, _, kind) in enumerate(properties):
+        values = np.frombuffer(b"".join(pieces[k]), stored(kind))
+        found[key] = PlyProperty(values.astype(declared[key]), np.array(counts[k], dtype=np.int64))
+    return found, start
+
+
+def ply_colours(file: MeshFile, element: dict[str, PlyProperty]) -> FloatArray | None:
+    """Return the colours of the rows of an element, [n, 3], None if it has none."""
+    for names in ("red green blue", "diffuse_red diffuse_green diffuse_blue", "r g b"):
+        if all(name in element for name in names.split()):
+            if "alpha" in element and (unit_colours(element["alpha"].values) < 1.0).any():
+                file.left_out("transparency: all is opaque")
+            return unit_colours(np.stack([element[name].values for name in names.split()], axis=1))
+    return None
+
+
+def _read_ply_parts(file: MeshFile, content: bytes) -> list[Part]:
+    """Return the parts of a PLY file, one for each texture, and one for strips of triangles."""
+    elements, comments = read_ply(content)
+    vertex, face = elements.get("vertex", {}), elements.get("face", {})
+    vertices = np.stack([vertex[key].values.astype(np.float64) for key in "xyz"], axis=1)
+    nothing = PlyProperty(np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64))
+    indices = face.get("vertex_indices", face.get("vertex_index", nothing))
+    flat = indices.values.astype(np.int64)
+    corners, owners = file.polygons(vertices, flat, indices.counts)
+    faces, colours, uv, parts = flat[corners], None, None, []
+    at_corners, of_rows = ply_colours(file, vertex), ply_colours(file, face)
+    if at_corners is not None and (of_rows is None or np.ptp(at_corners, axis=0).any()):
+        colours = at_corners[faces]
+        if of_rows is not None:
+            file.left_out("colours of polygons, as their corners have some as well")
+    elif of_rows is not None:
+        colours = np.repeat(of_rows[owners][:, None], 3, axis=1)
+    if "texcoord" in face and np.array_equal(face["texcoord"].counts, 2 * indices.counts):
+        uv = face["texcoord"].values.reshape(-1, 2)[corners]
+    for u, v in (("s", "t"), ("u", "v"), ("texture_u", "texture_v")):
+        if uv is None and u in vertex and v in vertex:
+            uv = np.stack((vertex[u].values, vertex[v].values), axis=1)[faces]
+    names = [text[12:].strip() for text in comments if text.lower().startswith("texturefile ")]
+    numbers = face["texnumber"].values[owners] if "texnumber" in face else np.zeros(len(faces))
+    for number in np.unique(numbers):
+        chosen, texture = numbers == number, None
+        if uv is not None and 0 <= number < len(names):
+            name = names[int(number)]
+            read = functools.partial(file.neighbour, name)
+            texture = file.texture(name, read, ("repeat", "repeat"))
+        part = Part(vertices, faces[chosen], None if colours is None else colours[chosen])
+        if texture is not None and uv is not None:
+            # In this format v goes up.
+            flipped = uv[chosen] * (1.0, -1.0) + (0.0, 1.0)
+            part = Part(vertices, faces[chosen], None, flipped, texture.texture)
+        parts.append(part)
+    if "tristrips" in elements:
+        values = elements["tristrips"]["vertex_indices"].values.astype(np.int64)
+        runs = np.split(values, np.flatnonzero(values == -1))
+        faces = np.concatenate([strip(run[run != -1]) for run in runs])
+        file.check_corners(vertices, faces)
+        parts.append(Part(vertices, faces, None if at_corners is None else at_corners[faces]))
+    return parts
+
+
+# OFF. trimesh reads no colours, and cuts polygons as if they were convex.
+
+
+def _read_off(file: MeshFile, content: bytes) -> list[Part]:
+    """Return the part of an OFF file, with colours of corners or polygons."""
+    lines = (line.split("#")[0].split() for line in content.decode("latin-1").splitlines())
+    rows = [line for line in lines if line]
+    head = re.fullmatch(r"(ST)?C?(N?)(4?n?)OFF", rows[0][0])
+    if head is not None:
+        rows = ([rows[0][1:]] if rows[0][1:] else []) + rows[1:]
+    if (head is not None and head[3]) or rows[0][0] == "BINARY":
+        raise file.error("must be an OFF file of text in three dimensions: save it as PLY")
+    first, last = (int(word) for word in rows[0][:2])
+    corners, faces = rows[1 : 1 + first], rows[1 + first : 1 + first + last]
+    if (len(corners), len(faces)) != (first, last) or any(len(f) <= int(f[0]) for f in faces):
+        raise file.error(f"must have {first} corners and {last} whole polygons: save it again")
+    vertices = np.array([row[:3] for row in corners], dtype=np.float64).reshape(-1, 3)
+    counts = np.array([int(row[0]) for row in faces], dtype=np.int64)
+    flat = np.array(
+        [int(word) for row in faces for word in row[1 : int(row[0]) + 1]], dtype=np.int64
+    )
+    places, owners = file.polygons(vertices, flat, counts)
+    # Files that call themselves OFF have colours after x, y, z and a normal, too.
+    start = 6 if head is not None and head[2] else 3
+    least = start + (5 if head is not None and head[1] else 3)
+    colours = None
+    if corners and all(len(row) >= least for row in corners):
+        shades = unit_colours(
+            np.array([row[start : start + 3] for row in corners], dtype=np.float64)
+        )
+        colours = shades[flat[places]]
+    elif any(len(row) > int(row[0]) + 3 for row in faces):
+        shades = np.array(
+            [(row[int(row[0]) + 1 :] + ["nan"] * 3)[:3] for row in faces], dtype=np.float64
+        )
+        colours = np.repeat(unit_colours(shades)[owners][:, None], 3, axis=1)
+    return [Part(vertices, flat[places], colours)]
+
+
+# STL. trimesh reads its triangles right, and hands over the two bytes in which colours are.
+
+
+def _read_stl(file: MeshFile, content: bytes) -> list[Part]:
+    """Return the parts of an STL file, one for each solid, with colours of triangles."""
+    with importing(
+        "trimesh",
+        f"reading the mesh {shown(str(file.path))}",
+        "pip install 'npa-envs[meshes]', or save it as PLY or GLB",
+    ):
+        from trimesh.exchange.stl import load_stl
+    read = load_stl(io.BytesIO(content))
+    parts = []
+    for solid in read["geometry"].values() if "geometry" in read else [read]:
+        vertices = np.asarray(solid["vertices"], dtype=np.float64)
+        colours = None
+        if "face_attributes" in solid:
+            colours = _stl_colours(np.asarray(solid["face_attributes"]["stl"]), content[:80])
+        parts.append(Part(vertices, np.asarray(solid["faces"], dtype=np.int64), colours))
+    return parts
+
+
+def _stl_colours(words: NDArray[np.uint16], head: bytes) -> FloatArray | None:
+    """Return the colours [F, 3, 3] in the last two bytes of binary triangles; NaN: none.
+
+    They are five bits each. VisCAM and SolidView set the highest bit of a triangle with a colour,
+    and store red highest. Magics has a colour for all in the head, the highest bit of triangles
+    that take it, and blue highest.
+    """
+    bits = np.stack([words >> shift & 31 for shift in (10, 5, 0)], axis=1) / 31.0
+    marked = (words >> 15).astype(bool)[:, None]
+    at = head.find(b"COLOR=")
+    if 0 <= at <= 70:
+        colours = np.where(marked, np.frombuffer(head, np.uint8, 3, at + 6) / 255.0, bits[:, ::-1])
+    elif marked.any():
+        colours = np.where(marked, bits, np.nan)
+    else:
+        return None
+    return np.repeat(colours[:, None], 3, axis=1)
+
+
+_READERS = {
+    ".glb": read_gltf,
+    ".gltf": read_gltf,
+    ".obj": read_obj,
+    ".off": _read_off,
+    ".ply": _read_ply_parts,
+    ".stl": _read_stl,
+}
+"""What reads the files of each suffix."""
