@@ -88,7 +88,7 @@ def _joined(file: MeshFile, parts: list[Part]) -> Mesh:
         which = "the file has none" if plain.all() else f"{plain.sum()} triangles have none"
         shade = "white" if file.plain == 1.0 else "grey"
         file.left_out(f"colours, as {which}: {'all is' if plain.all() else 'they are'} {shade}")
-    looks = [f"{total} triangles"]
+    looks = [f"{total} triangle" + "s" * (total > 1)]
     if number:
         size = "texture {1} x {0}".format(*textures[0].pixels.shape)
         looks.append(size if len(number) == 1 else f"{len(number)} textures")
@@ -96,7 +96,7 @@ def _joined(file: MeshFile, parts: list[Part]) -> Mesh:
         looks.append(f"{len(file.materials)} material" + "s" * (len(file.materials) > 1))
     elif not number:
         looks.append("no colours" if plain.all() else "colours of corners or faces")
-    summary = f"{file.path.name}: {', '.join(looks)}"
+    summary = f"{shown(file.path.name)[1:-1]}: {', '.join(looks)}"
     mesh = Mesh(vertices, faces, colours.clip(0.0, 1.0), summary=summary)
     if number:
         uv = np.nan_to_num(uv).clip(-_MAX_UV, _MAX_UV)
