@@ -49,7 +49,7 @@ class Morphogenesis3DConfig(GrowthConfig):
     """
 
     target: Common[str] = "mushroom"
-    """What to grow: a built-in mesh, a mesh file, or a folder in the format of NeRF-synthetic."""
+    """What to grow: a built-in mesh, a file of a mesh, points or Gaussians, or a views folder."""
 
     particle_count: Common[int] = 16384
     """Particles in a world, N."""

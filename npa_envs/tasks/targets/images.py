@@ -19,7 +19,9 @@ from npa_envs.tasks.targets.picture_modes import Mask, kind_of_tiff, to_rgba
 OPAQUE = 128
 """Minimum alpha of a pixel that belongs to a target, out of 255."""
 
-_BACKGROUND_TOLERANCE = 28  # of 255, in each of red, green and blue
+BACKGROUND_TOLERANCE = 28
+"""How far a background's red, green and blue may be from its colour, out of 255."""
+
 _UNIFORM = 0.95  # of the border's pixels
 _MAX_CUT_OUT = 2048  # pixels on each side
 _MAX_FILE = 256 * 2**20  # bytes
@@ -197,7 +199,7 @@ def cut_out_background(image: Image.Image, *, label: str) -> Image.Image:
     rgb = np.asarray(image.convert("RGB")).astype(np.float32)
     border = np.concatenate([rgb[0], rgb[-1], rgb[:, 0], rgb[:, -1]])
     background = np.median(border, axis=0)
-    uniform = (np.abs(border - background).max(axis=-1) <= _BACKGROUND_TOLERANCE).mean()
+    uniform = (np.abs(border - background).max(axis=-1) <= BACKGROUND_TOLERANCE).mean()
     if uniform < _UNIFORM:
         raise NPAError(
             f"target {shown(label)} is opaque, so at least {_UNIFORM:.0%} of its border must have "
@@ -205,20 +207,25 @@ def cut_out_background(image: Image.Image, *, label: str) -> Image.Image:
             "out: --keep-background grows the whole rectangle (in Python keep_background=True), "
             "or give a PNG or WebP with a transparent background"
         )
-    similar = np.abs(rgb - background).max(axis=-1) <= _BACKGROUND_TOLERANCE
-    outside = _connected_to_border(similar)
-    if outside.all():
+    cut = cut_out(image, background)
+    if cut.getextrema()[3] == (0, 0):
         raise NPAError(
             f"target {shown(label)} is opaque and of one colour all over, nothing to grow: give a "
             "picture with an object, best a PNG with a transparent background; --keep-background "
             "grows the whole rectangle (in Python keep_background=True)"
         )
-    colour, alpha = _unmix_edge(rgb, ~outside, background)
-    alpha = np.minimum(255 * alpha, np.asarray(image.getchannel("A")))
-    pixels = np.concatenate([colour, alpha[..., None]], axis=-1)
-    cut = Image.fromarray(pixels.round().clip(0, 255).astype(np.uint8), "RGBA")
     require_opaque_pixels(cut, label=label)
     return cut
+
+
+def cut_out(image: Image.Image, background: FloatImage) -> Image.Image:
+    """Return a picture with the `background`, a colour [3], made transparent next to its border."""
+    rgb = np.asarray(image.convert("RGB")).astype(np.float32)
+    similar = np.abs(rgb - background).max(axis=-1) <= BACKGROUND_TOLERANCE
+    colour, alpha = _unmix_edge(rgb, ~_connected_to_border(similar), background)
+    alpha = np.minimum(255 * alpha, np.asarray(image.getchannel("A")))
+    pixels = np.concatenate([colour, alpha[..., None]], axis=-1)
+    return Image.fromarray(pixels.round().clip(0, 255).astype(np.uint8), "RGBA")
 
 
 def resample(image: Image.Image, point_count: int, *, label: str = "picture") -> Image.Image:

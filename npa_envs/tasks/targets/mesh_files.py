@@ -218,7 +218,7 @@ def _read_rows(
     return found, start
 
 
-def _ply_colours(file: MeshFile, element: dict[str, PlyProperty]) -> FloatArray | None:
+def ply_colours(file: MeshFile, element: dict[str, PlyProperty]) -> FloatArray | None:
     """Return the colours of the rows of an element, [n, 3], None if it has none."""
     for names in ("red green blue", "diffuse_red diffuse_green diffuse_blue", "r g b"):
         if all(name in element for name in names.split()):
@@ -238,7 +238,7 @@ def _read_ply_parts(file: MeshFile, content: bytes) -> list[Part]:
     flat = indices.values.astype(np.int64)
     corners, owners = file.polygons(vertices, flat, indices.counts)
     faces, colours, uv, parts = flat[corners], None, None, []
-    at_corners, of_rows = _ply_colours(file, vertex), _ply_colours(file, face)
+    at_corners, of_rows = ply_colours(file, vertex), ply_colours(file, face)
     if at_corners is not None and (of_rows is None or np.ptp(at_corners, axis=0).any()):
         colours = at_corners[faces]
         if of_rows is not None:

@@ -2,22 +2,22 @@
 
 from __future__ import annotations
 
-import contextlib
+import functools
 import math
 import os
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import torch
 from torch import Tensor
 
-from npa_envs.atomic_files import home_path, read_json
-from npa_envs.checks import check_count, is_real
+from npa_envs.atomic_files import home_path
+from npa_envs.checks import check_count
 from npa_envs.errors import NPAError, shown
-from npa_envs.ops import Cameras, cameras_of_poses, look_at, orbit
-from npa_envs.tasks.targets.images import open_image, scaled_square
-from npa_envs.tasks.targets.meshes import RADIUS, Mesh, draw_mesh, load_mesh
+from npa_envs.ops import Cameras, look_at, orbit
+from npa_envs.tasks.targets.meshes import Mesh, draw_mesh, load_mesh
+from npa_envs.tasks.targets.splat_files import draw_splats, ply_kind, read_splats
 
 DISTANCE = 3.2
 """Distance of cameras from the origin [length units]."""
@@ -70,11 +70,14 @@ def load_views(
     training_count: int = 48,
     held_out_count: int = 12,
 ) -> ViewTarget:
-    """Make a target from a built-in mesh, a mesh file, or a folder in the format of NeRF-synthetic.
+    """Make a target from a built-in mesh, a mesh file, a PLY file of points, or a folder of views.
 
-    A mesh is drawn from cameras all around. Of a folder's pictures and cameras evenly spaced ones
-    are taken, at most `training_count` and `held_out_count`; the scene is rotated so that y is up,
-    and scaled into the ball of radius 0.85. Views have `resolution` pixels along each side.
+    Meshes, point clouds and trained Gaussians (3DGS) are drawn from cameras all around. A folder is
+    in the format of NeRF-synthetic, instant-ngp or nerfstudio; of a single `transforms.json` every
+    eighth view is held out. Evenly spaced views are taken, at most `training_count` and
+    `held_out_count`. Lenses are undistorted, and pictures become squares. The scene is rotated so
+    that y is up, and scaled into the ball of radius 0.85. Opaque pictures lose the plain background
+    around the thing. Views have `resolution` pixels along each side.
     """
     if not isinstance(source, str | Path) or not str(source):
         raise NPAError(
@@ -92,7 +95,15 @@ def load_views(
         )
     folder = home_path(source)
     if os.path.isdir(folder):
-        return read_nerf(folder, resolution, training_count, held_out_count)
+        # The readers make views.
+        from npa_envs.tasks.targets.view_folders import read_view_folder
+
+        return read_view_folder(folder, resolution, training_count, held_out_count)
+    if folder.suffix.lower() == ".ply" and folder.is_file() and ply_kind(folder) != "triangles":
+        splats = read_splats(folder)
+        draw = functools.partial(draw_splats, splats)
+        counted = (training_count, held_out_count)
+        return _views_around(draw, folder.stem, resolution, counted, splats.summary)
     mesh = load_mesh(source)
     return views_of_mesh(mesh, folder.stem, resolution, training_count, held_out_count)
 
@@ -101,11 +112,27 @@ def views_of_mesh(
     mesh: Mesh, name: str, resolution: int, training_count: int, held_out_count: int
 ) -> ViewTarget:
     """Return views of a mesh, which fits into the ball of radius 0.85, from cameras all around."""
+    counts = (training_count, held_out_count)
+
+    def draw(cameras: Cameras) -> Tensor:
+        return torch.from_numpy(draw_mesh(mesh, cameras))
+
+    return _views_around(draw, name, resolution, counts, mesh.summary)
+
+
+def _views_around(
+    draw: Callable[[Cameras], Tensor],
+    name: str,
+    resolution: int,
+    counts: tuple[int, int],
+    summary: str,
+) -> ViewTarget:
+    """Return views that a function draws, to train with and held out, from cameras all around."""
     views = []
-    for count, turn in ((training_count, 0.0), (held_out_count, 0.5)):
+    for count, turn in zip(counts, (0.0, 0.5), strict=True):
         cameras = surrounding_cameras(count, resolution, turn=turn)
-        views.append(Views(cameras, torch.from_numpy(draw_mesh(mesh, cameras))))
-    return ViewTarget(name, views[0], views[1], mesh.summary)
+        views.append(Views(cameras, draw(cameras)))
+    return ViewTarget(name, views[0], views[1], summary)
 
 
 def surrounding_cameras(count: int, resolution: int, *, turn: float = 0.0) -> Cameras:
@@ -152,127 +179,3 @@ def nearest_camera(cameras: Cameras, elevation: float) -> int:
     tilt = math.radians(elevation)
     front = positions.new_tensor((0.0, math.sin(tilt), math.cos(tilt)))
     return int((positions @ front / positions.norm(dim=1)).argmax())
-
-
-# Folders of pictures and cameras in the format of NeRF-synthetic (Mildenhall et al. 2020).
-
-TRAINING_FILE = "transforms_train.json"
-HELD_OUT_FILES = ("transforms_test.json", "transforms_val.json")
-
-OPAQUE_ALPHA = 0.5
-"""Alpha above which a pixel belongs to the scene."""
-
-UPRIGHT = ((1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.0, -1.0, 0.0))
-"""Rotation from the format's coordinates, z up, to ours, y up."""
-
-
-def read_nerf(
-    folder: Path, resolution: int, training_count: int, held_out_count: int
-) -> ViewTarget:
-    """Return the target in a NeRF-synthetic folder, as `load_views` describes."""
-    held_out = next((folder / name for name in HELD_OUT_FILES if (folder / name).is_file()), None)
-    if held_out is None or not (folder / TRAINING_FILE).is_file():
-        raise NPAError(
-            f"a folder of views must hold {TRAINING_FILE}, and {' or '.join(HELD_OUT_FILES)}, "
-            f"{shown(str(folder))} does not: views to measure by must be others than those trained "
-            "with"
-        )
-    training = _read_views(folder / TRAINING_FILE, resolution, training_count)
-    measured = _read_views(held_out, resolution, held_out_count)
-    radius = max(scene_radius(training), scene_radius(measured))
-    if radius == 0.0:
-        raise NPAError(
-            f"views must show something, but no picture of {shown(str(folder))} has a pixel of "
-            f"alpha above {OPAQUE_ALPHA}: give pictures with a transparent background"
-        )
-    for views in (training, measured):
-        views.cameras.world_to_camera[:, :3, 3] *= RADIUS / radius
-    return ViewTarget(folder.name, training, measured)
-
-
-def scene_radius(views: Views) -> float:
-    """Return a lower bound on the scene's radius [length units].
-
-    It is the largest distance from the origin of a camera ray on which something is visible. A
-    point is at least as far from the origin as the rays on which it is visible; with many views,
-    one of these rays nearly touches the farthest point.
-    """
-    cameras, radius = views.cameras, 0.0
-    lenses = cameras.intrinsics.double().expand(cameras.count, 4)
-    for motion, lens, picture in zip(
-        cameras.world_to_camera.double(), lenses, views.pictures, strict=True
-    ):
-        row, column = (picture[..., 3] > OPAQUE_ALPHA).nonzero(as_tuple=True)
-        if len(row) == 0:
-            continue
-        pixel = torch.stack((column, row), dim=-1) + 0.5
-        ray = torch.nn.functional.pad((pixel - lens[2:]) / lens[:2], (0, 1), value=1.0)
-        ray /= ray.norm(dim=1, keepdim=True)
-        # The origin in the camera's frame, and its distance from each ray.
-        away = torch.linalg.cross(ray, motion[:3, 3].expand_as(ray)).norm(dim=1)
-        radius = max(radius, float(away.max()))
-    return radius
-
-
-def _read_views(path: Path, resolution: int, count: int) -> Views:
-    """Return `count` evenly spaced views of a `transforms_*.json`, rotated so that y is up."""
-    file = shown(str(path))
-    try:
-        content = read_json(path)
-    except NPAError as error:
-        raise NPAError(f"cannot read {file} as JSON: {error}") from error
-    content = content if isinstance(content, dict) else {}
-    angle: Any = content.get("camera_angle_x")
-    frames = content.get("frames")
-    if not is_real(angle) or not 0.0 < angle < math.pi:
-        raise NPAError(
-            f"camera_angle_x in {file} must be an angle between 0 and pi radians, "
-            f"got {shown(angle)}"
-        )
-    if not isinstance(frames, list) or not frames:
-        raise NPAError(f"frames in {file} must be a list with at least one view")
-    files, poses = zip(
-        *(_read_frame(path, k, frame) for k, frame in enumerate(frames)), strict=True
-    )
-    total = len(files)
-    chosen = [k * total // min(count, total) for k in range(min(count, total))]
-    turned = torch.stack(poses)[chosen]
-    turned[:, :3] = torch.tensor(UPRIGHT, dtype=turned.dtype) @ turned[:, :3]
-    try:
-        cameras: Cameras = cameras_of_poses(
-            turned.float(), float(angle), width=resolution, height=resolution
-        )
-    except NPAError as error:
-        raise NPAError(f"in {file}: {error}") from error
-    pictures = []
-    for picture in (files[k] for k in chosen):
-        image = open_image(picture)
-        if image.width != image.height:
-            raise NPAError(
-                f"views must be square, {shown(str(picture))} has {image.width} x {image.height} "
-                "pixels: cut them to squares around the middle, and correct camera_angle_x"
-            )
-        pictures.append(torch.from_numpy(scaled_square(image, resolution)))
-    return Views(cameras, torch.stack(pictures))
-
-
-def _read_frame(path: Path, number: int, frame: Any) -> tuple[Path, Tensor]:
-    """Return the picture's file and the pose of a frame of a `transforms_*.json`."""
-    frame, where = frame if isinstance(frame, dict) else {}, f"frame {number} in {shown(str(path))}"
-    name, matrix = frame.get("file_path"), frame.get("transform_matrix")
-    if not isinstance(name, str) or not name:
-        raise NPAError(f"{where} must have a file_path, got {shown(name)}")
-    pose = torch.empty(0)
-    with contextlib.suppress(TypeError, ValueError, RuntimeError, OverflowError):
-        pose = torch.tensor(matrix, dtype=torch.float64)
-    if pose.shape != (4, 4):
-        raise NPAError(f"transform_matrix of {where} must be 4 x 4 numbers, got {shown(matrix)}")
-    inside = os.path.normpath(name)
-    if os.path.isabs(name) or inside == os.curdir or inside.split(os.sep)[0] == os.pardir:
-        raise NPAError(
-            f"file_path of {where} must name a file in that folder, got {shown(name)}: put the "
-            "pictures next to it"
-        )
-    file = path.parent / inside
-    # The format's file_path has no suffix.
-    return (file if file.suffix else file.with_name(file.name + ".png")), pose
