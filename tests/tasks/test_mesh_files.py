@@ -550,7 +550,7 @@ def test_textures_of_obj_and_ply_files_have_v_upwards(tmp_path, caplog):
     assert mesh.uv.tolist() == [[[0, 1], [1, 1], [0, 0]]]
     assert np.array_equal(mesh.textures[0].pixels, HALVES)
     assert shades(mesh) == {(255, 255, 255)}
-    assert mesh.summary == "t.obj: 1 triangles, texture 2 x 2, 1 material"
+    assert mesh.summary == "t.obj: 1 triangle, texture 2 x 2, 1 material"
     assert [text.split(": ", 2)[2] for text in caplog.messages] == [
         "options of the texture '-s 2 3 1 -clamp on my halves.png'",
         "black of a material with a texture, as it would hide that",

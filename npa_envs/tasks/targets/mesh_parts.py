@@ -22,8 +22,8 @@ MAX_TRIANGLES = 2**23
 """Maximum number of triangles of a mesh."""
 
 _MAX_TEXELS = 2**27
-_MAX_WORK = 2**31
-_MAX_SEARCHES = 32
+_MAX_WORK = 2**28
+_MAX_SEARCHES = 4
 _VECTORISED = 40  # corners
 
 
