@@ -9,6 +9,7 @@ from typing import Any, Self
 
 import torch
 from torch import Tensor
+from torch.nn import functional
 
 from npa_envs.checks import (
     are_texts,
@@ -155,6 +156,12 @@ FINER_TIMES = 4
 
 SURVIVING = 0.5
 """Probability that a particle survives damage, in worlds whose particles divide."""
+
+WOUND_CHANGE = 0.1
+"""A pixel is part of a wound if damage changes its colours and density by more than this in sum."""
+
+WIDEST_WOUND = 0.35
+"""Fraction of the pixels beyond which a change of a picture has no place and counts as no wound."""
 
 FAR_AWAY = 1e3
 """Coordinate to which dead particles are moved, out of every picture [length units]."""
@@ -305,9 +312,32 @@ class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
 
     def compare(self, worlds: Particles) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the batch's weighted splat loss, [], and its terms "density" and "colour", []."""
-        density, colour = (term.mean() for term in self.splat_losses(worlds.x, worlds.s))
-        total = self.config.splat_weight * (density + self.config.colour_weight * colour)
-        return total, {"density": density, "colour": colour}
+        config, x, s = self.config, worlds.x, worlds.s
+        if self._wounds is None:
+            density, colour = (term.mean() for term in self.splat_losses(x, s))
+            total = config.splat_weight * (density + config.colour_weight * colour)
+            return total, {"density": density, "colour": colour}
+        each, (wounds, weight) = self.splat_errors(x, s), self._wounds
+        density, colour = (scalar_world_mean(errors).mean() for errors in each)
+        wound = local_means(each[0] + config.colour_weight * each[1], wounds).mean()
+        total = density + config.colour_weight * colour + weight * wound
+        return config.splat_weight * total, {"density": density, "colour": colour, "wound": wound}
+
+    @torch.no_grad()
+    def wounds_between(self, before: Particles, after: Particles) -> Tensor:
+        """Return which pixels of each world's picture a damage has changed, uint8, [B, R, R].
+
+        Pixels around them are included, by a square of ε / 2. Pictures are centred as worlds were
+        before. A world whose picture changed nearly everywhere has no such pixels.
+        """
+        if self._tries_angles:
+            return super().wounds_between(before, after)
+        shift = (self._target_mean.to(before.x) - world_mean(before.x))[:, None]
+        old, new = (self.picture(w.x + shift, w.s, centred=False) for w in (before, after))
+        changed = ((new - old).abs().sum(dim=-1) > WOUND_CHANGE).to(old.dtype)
+        margin = round(self.eps * self.config.resolution / 8.0)
+        near = functional.max_pool2d(changed[:, None], 2 * margin + 1, 1, margin)[:, 0]
+        return (near * (near.mean((1, 2), keepdim=True) < WIDEST_WOUND)).to(torch.uint8)
 
     @property
     def rule_shape(self) -> dict[str, Any]:
@@ -419,6 +449,16 @@ class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
             pixel_size=self.pixel_size,
             sigma=self.config.sigma,
         )
+
+
+def local_means(errors: Tensor, places: Tensor) -> Tensor:
+    """Return each world's mean of errors [B, R, R] over pixels where `places` is 1, else 0, [B].
+
+    It is 0 for a world without such pixels.
+    """
+    places = places.to(errors.dtype)
+    share = scalar_world_mean(places).clamp_min(1.0 / places[0].numel())
+    return scalar_world_mean(errors * places) / share
 
 
 def turns(angle: Tensor, hand: Tensor) -> Tensor:
