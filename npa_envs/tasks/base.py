@@ -104,6 +104,10 @@ class ParticleTask(Generic[ConfigT]):
     aligned: bool = False
     """Whether worlds are compared with `target_picture` pixel by pixel, so a PSNR makes sense."""
 
+    grows_picture: bool = False
+    """Whether worlds grow one picture or object, so that healing is measured near wounds: the task
+    has `pixel_errors`, `pixels_near` and `spread_places`, as `Morphogenesis2D` explains them."""
+
     has_views: bool = False
     """Whether the task is a `Morphogenesis3D`, whose worlds are drawn from any camera."""
 

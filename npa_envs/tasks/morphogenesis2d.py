@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Self
 
@@ -26,6 +26,7 @@ from npa_envs.ops.world_mean import scalar_world_mean
 from npa_envs.rule.picture_codes import replace_code
 from npa_envs.rule.rule import COLOUR_OFFSET, LIFE, NPARule
 from npa_envs.tasks.base import GrowthConfig, GrowthTask
+from npa_envs.tasks.seeds import spread_points
 from npa_envs.tasks.targets.images import MAX_POINT_COUNT
 from npa_envs.tasks.targets.picture_points import PointTarget, load_target
 from npa_envs.tasks.train_config import Common, TrainConfig, fast_run, presets_of, tiny_run
@@ -175,6 +176,7 @@ class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
     """The task of growing a picture of arXiv 2601.16096, section 4.1, with its loss."""
 
     metric_name = "splat loss"
+    grows_picture = True
     _code: Tensor | None = None
 
     def __init__(
@@ -297,6 +299,35 @@ class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
         red, green, blue, density = (size + size * size).unbind(dim=-1)
         return density, (red + green + blue) / 3.0 * torch.exp(-density.detach())
 
+    def pixel_errors(self, x: Tensor, s: Tensor) -> Tensor:
+        """Return each pixel's splat loss, whose mean is `metric`, dimensionless, [B, R, R]."""
+        density, colour = self.splat_errors(x, s)
+        return density + self.config.colour_weight * colour
+
+    def pixels_near(
+        self, worlds: Particles, distance: Callable[[Tensor], Tensor], margin: float
+    ) -> Tensor:
+        """Return at which pixels of `pixel_errors` there is a point nearer than `margin`, bool.
+
+        `distance` maps points [B, M, D] in the worlds to distances [B, M] [length units].
+        """
+        side = self.config.resolution
+        at = torch.linspace(-1.0, 1.0, side, device=worlds.x.device, dtype=worlds.x.dtype)
+        grid = torch.stack(torch.meshgrid(at, at, indexing="xy"), dim=-1).flatten(0, 1)
+        return (distance(self._in_worlds(grid, worlds)) < margin).view(-1, side, side)
+
+    def spread_places(self, count: int, worlds: Particles) -> Tensor:
+        """Return places in each world, spread over its body, [length units], [B, count, D]."""
+        return self._in_worlds(spread_points(self.target.points, count), worlds)
+
+    def _in_worlds(self, points: Tensor, worlds: Particles) -> Tensor:
+        """Return where points [M, 2] of the target lie in worlds that match it, [B, M, 2]."""
+        x, s, *_ = worlds
+        points = (points - self._target_mean).to(x).expand(len(x), -1, -1)
+        if self._tries_angles:
+            points = turned(points, self.best_turn(x, s).mT)
+        return points + world_mean(x)[:, None]
+
     def splat_losses(self, x: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
         """Return each world's density loss and colour loss, means of `splat_errors`, [B] each."""
         with_gradient = torch.is_grad_enabled() and (x.requires_grad or s.requires_grad)
@@ -374,8 +405,7 @@ class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
         `metric`, up to rounding.
         """
         with torch.no_grad():
-            density, colour = self.splat_errors(x, s)
-            errors = density + self.config.colour_weight * colour
+            errors = self.pixel_errors(x, s)
         blank = x.new_zeros(*x.shape[:2], 3).requires_grad_()
         with torch.enable_grad():
             picture = self._splat(self._aligned(x.detach(), s), blank)
@@ -452,7 +482,7 @@ class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
 
 
 def local_means(errors: Tensor, places: Tensor) -> Tensor:
-    """Return each world's mean of errors [B, R, R] over pixels where `places` is 1, else 0, [B].
+    """Return each world's mean of errors [B, ...] over pixels where `places` is 1, else 0, [B].
 
     It is 0 for a world without such pixels.
     """
