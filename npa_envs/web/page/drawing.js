@@ -364,7 +364,7 @@ function linked(gl, vertex, fragment) {
 }
 
 const PLAIN_PIXELS = [640, 1200]; // on the longer side of the small picture, least and most
-const PLAIN_TIME = 10; // milliseconds that a picture may take
+const PLAIN_TIME = 16; // milliseconds that a picture may take
 const COVERS = Float32Array.from({ length: 1024 }, (_, k) => {
   const rise = Math.min(1, Math.max(0, (k / 1024 - 0.06) / 0.24));
   return rise * rise * (3 - 2 * rise);

@@ -200,8 +200,9 @@ class Page {
     const width = Math.round(canvas.clientWidth * ratio), height = Math.round(canvas.clientHeight * ratio);
     if (!width || !height) return;
     if (canvas.width !== width || canvas.height !== height) Object.assign(canvas, { width, height });
-    // A box may also extend below the bar.
-    camera.covered = world.box ? 0 : (canvas.clientHeight - $("bar").offsetTop) / canvas.clientHeight;
+    // A box may also extend below the bar, and below the panel, which on a phone is above the bar.
+    const edge = Math.min($("bar").offsetTop, $("panel").getBoundingClientRect().top || Infinity);
+    camera.covered = world.box ? 0 : (canvas.clientHeight - edge) / canvas.clientHeight;
     this.painter.draw({
       positions: frame?.positions ?? new Float32Array(), colours: frame?.colours ?? new Uint8Array(),
       dimension: world.dimension, box: world.box, spot: world.spot * $("size").value, camera,
@@ -432,6 +433,7 @@ class Controls {
 
   fold(away) {
     $("panel").hidden = away;
+    this.page.dirty = true;
     $("fold").setAttribute("aria-expanded", String(!away));
   }
 
@@ -513,7 +515,7 @@ class Film {
     $("film").open = true;
     $("writing").hidden = true;
     this.page.controls.fold(false);
-    item.scrollIntoView({ block: "nearest" });
+    item.scrollIntoView({ block: "center" });
     return link;
   }
 
