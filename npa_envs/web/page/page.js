@@ -16,7 +16,7 @@ const LOOK = { name: "look", label: "Look: drag to move or turn, wheel or pinch 
 
 // What colours mean, by the names of `shows_of` of live_world.py, those of state channels without their number.
 const MEANINGS = {
-  colours: "What a particle shows of its state: its part of the picture.",
+  colours: "The particles' own colours: the picture, or the class that each names.",
   density: "How crowded it is around a particle, from dark to bright.",
   components: "The three directions in which states differ most, as red, green and blue: like colour, like state.",
   species: "Which rule a particle follows.",
