@@ -167,6 +167,38 @@ def test_noise_scatters_the_particles_below_the_brush_as_in_the_viewer(run, sett
         assert abs(float((moved / weight)[near].std()) - 0.04) < 0.015
 
 
+@pytest.mark.slow
+def test_wounds_heal_in_a_page_as_in_the_viewer(run):
+    settings = settings_of(page_rule("gecko", particle_count=1024))
+    world = RuleWorld("gecko", device=torch.device("cpu"), particle_count=1024)
+    world.speed = 50
+
+    def grown(*script):
+        speed = {"type": "set", "name": "speed", "value": world.speed}
+        result = live(run, settings, speed, *[ADVANCE] * 10, *script)
+        return Particles(*(unpacked(result[n], getattr(world.particles, n).shape) for n in "xs"))
+
+    def loss(particles, where):
+        density, colour = world.task.splat_errors(*particles[:2])
+        return float((density + world.task.config.colour_weight * colour)[where].mean())
+
+    before = grown()
+    for place in ([0.0, 0.5], [-0.4, 0.2], [0.3, -0.3]):
+        wipe = {"type": "brush", "tool": "wipe", "at": place, "radius": 0.2, "strength": 1.0}
+        wounded = grown(wipe)
+        healed = grown(wipe, *[ADVANCE] * 10)
+        world.particles = wounded
+        for _ in range(10):
+            world.advance()
+        where = (world.task.picture(*wounded[:2]) - world.task.picture(*before[:2])).abs()
+        where = where.amax(dim=-1) > 0.1
+        least, most = loss(before, where), loss(wounded, where)
+        assert most > 2.0 * least
+        # Of what the wound added, at most 0.1 and 0.3 were left.
+        for after in (healed, world.particles):
+            assert loss(after, where) < least + 0.5 * (most - least)
+
+
 def test_a_world_without_particles_goes_on(run, settings):
     everything = {"type": "brush", "tool": "remove", "at": [0, 0], "radius": 9, "strength": 1}
     assert last(live(run, settings, everything, ADVANCE, ADVANCE), "frame")["colours"] == []
