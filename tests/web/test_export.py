@@ -26,7 +26,7 @@ from npa_envs.web.rule_world import RuleWorld
 from npa_envs.world.brushes import nearest_image
 from npa_envs.world.particles import Particles
 
-NODE_SECONDS = 60
+NODE_SECONDS = 300
 
 
 @pytest.fixture(scope="module")
