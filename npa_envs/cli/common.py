@@ -122,6 +122,19 @@ def named_rules(arguments: Iterable[str]) -> dict[str, str]:
     return sources
 
 
+def check_has_rule(name: str) -> None:
+    """Raise NPAError if `name` is a built-in target for which no rule is shipped."""
+    from npa_envs.rule.files import preset_rules, shipped_rules
+    from npa_envs.training import TASKS
+
+    if Path(name).exists() or name in {**shipped_rules(), **preset_rules()}:
+        return
+    for task, entry in TASKS.items():
+        if name in entry.targets():
+            train = f"train one with npa-envs train {task} --target {name} --out runs/{name}"
+            raise NPAError(f"{name} is a target, and no rule for it is shipped: {train}")
+
+
 def duration(seconds: float) -> str:
     """Return a time [s] as rounded text, for example "3 minutes"."""
     for unit, size in (("hours", 3600.0), ("minutes", 60.0)):

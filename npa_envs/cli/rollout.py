@@ -64,6 +64,7 @@ def main(arguments: Sequence[str]) -> int:
     from npa_envs.training.run_folder import stop_flag
     from npa_envs.training.task_of_rule import task_for_film, task_of_rule
 
+    common.check_has_rule(options.rule)
     damages = checked_damages(options)
     device = options.checked_device()
     rule = load_rule(options.rule, device=device).float()

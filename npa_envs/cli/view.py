@@ -122,6 +122,7 @@ def world_maker(options: ViewOptions, device: torch.device) -> Callable[[], Live
         raise NPAError(
             f"{name} is for environments, got --{name} with a rule or a run: leave it out"
         )
+    common.check_has_rule(options.what)
     kwargs: Any = {"device": device, "seed": options.seed, "particle_count": options.particle_count}
     run_files = ("config.json", "log.jsonl", "checkpoint.pt")
     if folder.is_dir() and any((folder / name).exists() for name in run_files):

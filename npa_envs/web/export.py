@@ -282,7 +282,7 @@ def _gallery(title: str, previews: Mapping[str, str]) -> str:
     return f"""<section id="gallery">
 <h1>{html.escape(title)}</h1>
 <p>Small neural networks, one in every particle.
-Choose one, watch it grow, then remove a part of it.</p>
+Choose one, watch it grow, then wipe a part of it: it heals.</p>
 <ul>
 {links}
 </ul>

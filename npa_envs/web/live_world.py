@@ -17,8 +17,9 @@ from npa_envs.ops import species_fields
 from npa_envs.render.colours import GOLDEN_ANGLE, STATE_CHROMA, STATE_GAIN, ramp, srgb
 from npa_envs.tasks.damage import check_damage, damage_worlds
 from npa_envs.web.messages import BRUSHES, SEEDS, Brush, BrushUse, FrameEvent, Range, WorldEvent
-from npa_envs.world.brushes import clump, cut, inject, push, state_around
+from npa_envs.world.brushes import clump, cut, inject, push, softness, state_around, wipe_state
 from npa_envs.world.particles import Particles
+from npa_envs.world.randomness import normal_draws
 
 
 class LiveWorld(ABC):
@@ -26,6 +27,9 @@ class LiveWorld(ABC):
 
     particles: Particles
     """The world, as a batch of one."""
+
+    _generator: torch.Generator | None = None
+    """Random numbers of damage and brushes; None: torch's own."""
 
     def __init__(self, seed: int) -> None:
         self.seed = int(SEEDS.checked("seed", seed))
@@ -139,13 +143,19 @@ class LiveWorld(ABC):
     def _shows(self) -> list[str]: ...
 
     def _damage(self, name: str) -> None:
-        self.particles = damage_worlds(self.particles, kind=name, box=self.box)
+        options: Any = {"box": self.box, "generator": self._generator}
+        self.particles = damage_worlds(self.particles, kind=name, **options)
 
     def _use_brush(self, use: BrushUse) -> bool:
         """Apply a brush; return whether `describe` returns something else now."""
         x, s, *_ = self.particles
         disk: dict[str, Any] = {"radius": use.radius, "box": self.box}
         match use.brush:
+            case "wipe":
+                s = wipe_state(x, s, centre=use.at, **disk)
+            case "noise":
+                deviation = use.amount * use.radius * softness(x, centre=use.at, **disk)
+                x = x + deviation * normal_draws(self._generator, x.shape, x)
             case "push":
                 x = push(x, centre=use.at, move=use.move, strength=use.amount, **disk)
             case "clump":

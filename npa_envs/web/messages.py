@@ -103,7 +103,7 @@ class Brush(NamedTuple):
     """A brush of the viewer: its button, and when it sends messages."""
 
     changes: str  # What a world must let it change, see `LiveWorld._allowed`.
-    label: str  # Text of its button.
+    label: str  # The word below its button, and after a colon what it does.
     sends: str
     """When a stroke, from press to release of the pointer, sends messages: "frame", in each frame;
     "motion", in frames in which the pointer moves; "position", at each new position; "once", at its
@@ -114,23 +114,35 @@ class Brush(NamedTuple):
 
 
 BRUSHES = {
-    "remove": Brush("removal", "Remove", "frame"),
-    "push": Brush("positions", "Push with the pointer", "motion", amounts=(0.5, 1.0)),
-    "clump": Brush("positions", "Clump", "frame", amounts=(0.0, 0.25)),
-    "cut": Brush("positions", "Cut along a line", "line"),
+    "wipe": Brush("states", "Wipe: sets states to zero; the world heals it", "frame"),
+    "cut": Brush("positions", "Cut: opens a slit along the line that you draw", "line"),
+    "push": Brush(
+        "positions",
+        "Pull: carries particles along with the pointer",
+        "motion",
+        amounts=(0.5, 1.0),
+    ),
+    "clump": Brush("positions", "Clump: draws particles together", "frame", amounts=(0.0, 0.25)),
+    "noise": Brush("positions", "Noise: scatters particles", "frame", amounts=(0.0, 0.2)),
     "inject": Brush(
         "states",
-        "Inject: the state of where you press spreads to where you drag",
+        "Inject: spreads the state of where you press",
         "frame",
         takes="source",
         amounts=(0.0, 0.5),
     ),
-    "graft": Brush("species", "Graft: particles take another rule", "position", takes="rule"),
-    "add": Brush("growth", "Add a seed of another rule", "once", takes="rule", amounts=(0.0, 0.5)),
+    "graft": Brush("species", "Graft: gives particles another rule", "position", takes="rule"),
+    "add": Brush(
+        "growth", "Add: puts in a seed of another rule", "once", takes="rule", amounts=(0.0, 0.5)
+    ),
+    "remove": Brush("removal", "Remove: takes particles away, for good", "frame"),
 }
-"""All brushes, in the order of their buttons and keys. `LiveWorld._use_brush` applies those that
-change positions or states, `RuleWorld._use_brush` the others, and `BRUSHES` of rule_world.js all.
-Icons are in page.js."""
+"""All brushes, in the order of their buttons and keys; a page begins with the first of its world.
+`LiveWorld._use_brush` applies those that change positions or states, `RuleWorld._use_brush` the
+others, and `BRUSHES` of rule_world.js all. Icons are in page.js."""
+
+MAKES_ROOM = "Remove: takes particles away, which makes room for new ones"
+"""The label of `remove` where particles divide."""
 
 
 class BrushUse(NamedTuple):

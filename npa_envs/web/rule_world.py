@@ -17,14 +17,14 @@ from npa_envs.rule.files import load_rule, rule_metadata, rule_name, shipped_rul
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.base import Task
 from npa_envs.tasks.co_morphogenesis2d import CoMorphogenesis2DConfig, together
-from npa_envs.tasks.damage import DAMAGE_SIZES, damage_worlds
+from npa_envs.tasks.damage import DAMAGE_SIZES
 from npa_envs.tasks.seeds import uniform_ball
 from npa_envs.tasks.train_config import TrainConfig
 from npa_envs.training.run_folder import JsonlLog, RunFolder
 from npa_envs.training.task_of_rule import TrainedTask, task_of_rule, trained_config
 from npa_envs.training.task_table import load_config, preset
 from npa_envs.web.live_world import ColouredWorld, Colouring, LiveWorld, shows_of
-from npa_envs.web.messages import BrushUse, Range, WorldEvent
+from npa_envs.web.messages import MAKES_ROOM, Brush, BrushUse, Range, WorldEvent
 from npa_envs.world.brushes import inside_ball, wipe_state
 from npa_envs.world.division import living
 from npa_envs.world.particles import Particles
@@ -161,6 +161,14 @@ class RuleWorld(LiveWorld):
             "damages": list(DAMAGE_SIZES),
             "capabilities": ["film", *([] if self.trained.why_not_measurable else ["loss"])],
         }
+
+    @property
+    def brushes(self) -> dict[str, Brush]:
+        """The brushes that the world offers, by name."""
+        brushes = super().brushes
+        if self.main.rule.divides:
+            brushes["remove"] = brushes["remove"]._replace(label=MAKES_ROOM)
+        return brushes
 
     def handle(self, message: Mapping[str, Any]) -> bool:
         """Apply a message of the page; return whether `describe` returns something else now."""
@@ -304,9 +312,8 @@ class RuleWorld(LiveWorld):
     @torch.no_grad()
     def _damage(self, name: str) -> None:
         if self.particles.x.shape[1]:
-            options: Any = {"kind": name, "box": self.box, "generator": self._generator}
-            damaged = damage_worlds(self.particles, **options)
-            self.particles = damaged._replace(s=self._all_coded(damaged.s))
+            super()._damage(name)
+            self.particles = self.particles._replace(s=self._all_coded(self.particles.s))
 
     @torch.no_grad()
     def _use_brush(self, use: BrushUse) -> bool:
@@ -325,7 +332,8 @@ class RuleWorld(LiveWorld):
             case "add":
                 self._add(use)
             case _:
-                return super()._use_brush(use)
+                super()._use_brush(use)
+                self.particles = self.particles._replace(s=self._all_coded(self.particles.s))
         return before != [live_rule.name for live_rule in self.live_rules]
 
     def _graft(self, use: BrushUse) -> None:

@@ -9,7 +9,7 @@ function makeElement() {
     dataset: {}, style: {}, children: [], value: "0.1", hidden: false, open: false, checked: false, textContent: "",
     classList: { add() {}, remove() {}, toggle() {} }, clientWidth: 100, clientHeight: 100, offsetTop: 80,
     width: 100, height: 100, setAttribute() {}, remove() {}, addEventListener() {},
-    getBoundingClientRect: () => ({ left: 0, top: 0 }), setPointerCapture() {},
+    getBoundingClientRect: () => ({ left: 0, top: 0 }), setPointerCapture() {}, scrollIntoView() {},
     append: (...added) => element.children.push(...added),
     prepend: (...added) => element.children.unshift(...added),
     replaceChildren: (...added) => (element.children = added),

@@ -26,7 +26,7 @@ from npa_envs.web.rule_world import RuleWorld
 from npa_envs.world.brushes import nearest_image
 from npa_envs.world.particles import Particles
 
-NODE_SECONDS = 60
+NODE_SECONDS = 300
 
 
 @pytest.fixture(scope="module")
@@ -111,11 +111,11 @@ def test_a_live_world_moves_and_the_same_seed_gives_the_same_world(run, settings
 
 PAUSE = {"type": "play", "on": False}
 BRUSHES = {
-    "remove": {}, "push": {"move": [0.05, -0.1]}, "clump": {}, "cut": {"move": [0.1, 0.2]},
+    "wipe": {}, "remove": {}, "push": {"move": [0.05, -0.1]}, "clump": {}, "cut": {"move": [0.1, 0.2]},
     "inject": {"source": [-0.1, 0.1]}, "inject nothing": {"source": [5.0, 5.0]},
     "graft": {},
 }  # fmt: skip
-"""Fields of their messages; "add", which draws positions, is tested below."""
+"""Fields of their messages; "noise" and "add", which draw numbers, are tested below."""
 
 GRAFTED = {"gecko": "heart", "dots": "dots", "duck": "duck"}
 """A rule that may join the world of each rule; the second one is periodic, the last one 3D."""
@@ -148,6 +148,55 @@ def test_brushes_of_a_page_are_those_of_the_viewer(run, settings, rule, name):
     same = torch.equal(world.particles.x, x) and torch.equal(world.particles.s, s)
     unchanged = (("gecko", "inject nothing"), ("dots", "graft"), ("duck", "graft"))
     assert same == ((rule, name) in unchanged)
+
+
+def test_noise_scatters_the_particles_below_the_brush_as_in_the_viewer(run, settings):
+    message = {"type": "brush", "tool": "noise", "at": [0.1, 0.0], "radius": 0.2, "strength": 1.0}
+    before, after = (live(run, settings, PAUSE, *more) for more in ((), (message,)))
+    x = unpacked(before["x"], (300, 2))
+    world = RuleWorld("gecko", device=torch.device("cpu"), particle_count=300)
+    world.particles = world.particles._replace(x=x[None])
+    world.handle(message)
+    square = (x - torch.tensor(message["at"])).square().sum(dim=-1, keepdim=True) / 0.2**2
+    weight = (1.0 - square).clamp_min(0.0).square()
+    near = weight[:, 0] > 0.1
+    assert 30 < int(near.sum()) < 290
+    for moved in (unpacked(after["x"], (300, 2)) - x, world.particles.x[0] - x):
+        assert float(moved[weight[:, 0] == 0].abs().max()) == 0.0
+        # A fifth of the radius at the centre; the bound is over six standard errors.
+        assert abs(float((moved / weight)[near].std()) - 0.04) < 0.015
+
+
+@pytest.mark.slow
+def test_wounds_heal_in_a_page_as_in_the_viewer(run):
+    settings = settings_of(page_rule("gecko", particle_count=1024))
+    world = RuleWorld("gecko", device=torch.device("cpu"), particle_count=1024)
+    world.speed = 50
+
+    def grown(*script):
+        speed = {"type": "set", "name": "speed", "value": world.speed}
+        result = live(run, settings, speed, *[ADVANCE] * 10, *script)
+        return Particles(*(unpacked(result[n], getattr(world.particles, n).shape) for n in "xs"))
+
+    def loss(particles, where):
+        density, colour = world.task.splat_errors(*particles[:2])
+        return float((density + world.task.config.colour_weight * colour)[where].mean())
+
+    before = grown()
+    for place in ([0.0, 0.5], [-0.4, 0.2], [0.3, -0.3]):
+        wipe = {"type": "brush", "tool": "wipe", "at": place, "radius": 0.2, "strength": 1.0}
+        wounded = grown(wipe)
+        healed = grown(wipe, *[ADVANCE] * 10)
+        world.particles = wounded
+        for _ in range(10):
+            world.advance()
+        where = (world.task.picture(*wounded[:2]) - world.task.picture(*before[:2])).abs()
+        where = where.amax(dim=-1) > 0.1
+        least, most = loss(before, where), loss(wounded, where)
+        assert most > 2.0 * least
+        # Of what the wound added, at most 0.1 and 0.3 were left.
+        for after in (healed, world.particles):
+            assert loss(after, where) < least + 0.5 * (most - least)
 
 
 def test_a_world_without_particles_goes_on(run, settings):
@@ -194,7 +243,7 @@ def test_settings_reach_the_world_and_wrong_messages_are_reported(run, settings)
         "nothing to show is called nothing", "no damage is called luck", "no brush is called luck",
         "no message is called fly"
     ]  # fmt: skip
-    assert {name.split()[0] for name in BRUSHES} | {"add"} == set(messages.BRUSHES)
+    assert {name.split()[0] for name in BRUSHES} | {"noise", "add"} == set(messages.BRUSHES)
     whole = live(run, settings, *[ADVANCE] * 3)
     x = unpacked(whole["x"], (300, 2))
     farthest_moves = {"wipe": 0.0, "cut": 0.05, "clump": 0.18, "noise": 0.25}

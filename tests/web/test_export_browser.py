@@ -50,6 +50,7 @@ def test_an_exported_page_lives_and_is_touched(exported):
         "(({ left, top, width, height }) => [left + width / 2, top + height / 2])"
         "(document.getElementById('world').getBoundingClientRect())"
     )
+    page.run("document.querySelector('[data-brush=remove]').click()")
     page.drag([(x, y), (x + 20, y)])
     assert 0 < page.wait(f"{COUNT} < 512 && {COUNT}") < 512
     page.run("document.page.send({ type: 'set', name: 'eps', value: 0.12 })")

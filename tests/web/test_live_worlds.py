@@ -191,8 +191,9 @@ def test_a_world_that_divides_shows_its_living_particles(tmp_path, device):
     rule, path = with_division(load_rule("gecko")), tmp_path / "dividing.safetensors"
     world = world_of(rule, path, device, division=True, particle_count=64)
     assert len(world.frame().positions) == 1
-    names = [brush["name"] for brush in world.describe()["tools"]]
-    assert names == ["remove", "push", "clump", "cut"]
+    tools = {brush["name"]: brush["label"] for brush in world.describe()["tools"]}
+    assert list(tools) == ["cut", "push", "clump", "noise", "remove"]
+    assert tools["remove"].endswith("makes room for new ones")
     put(world, speed=8)
     for show in ("colours", "mask", "speed", "density", "components", "species", "state 3"):
         put(world, show=show)
@@ -218,7 +219,19 @@ def test_what_is_added_to_a_world_of_a_rule_with_codes_carries_one(device):
     for damage in DAMAGE_SIZES:
         world.handle({"type": "damage", "name": damage})
     world.handle(brush("graft", rule="seven-pictures"))
+    world.handle(brush("wipe"))
     assert torch.equal(world.particles.s[0, :, :8], code.expand(world.particles.s.shape[1], 8))
+
+
+def test_wipe_sets_states_to_zero_and_keeps_particles(world):
+    advance(world, 8)
+    x, s, *_ = world.particles
+    inside = x[0].norm(dim=-1) <= 0.1
+    world.handle(brush("wipe"))
+    assert torch.equal(world.particles.x, x)
+    assert torch.equal(world.particles.s[0, ~inside], s[0, ~inside])
+    assert 0 < int(inside.sum()) < COUNT
+    assert float(world.particles.s[0, inside].abs().max()) == 0.0
 
 
 def test_push_carries_particles_along_and_clump_and_cut_move_them(world):

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from npa_envs.web.live_world import shows_of
 from npa_envs.web.messages import BRUSHES
 
 SENT_BRUSHES = [{"name": name} | brush._asdict() for name, brush in BRUSHES.items()]
@@ -76,14 +77,57 @@ def test_each_brush_sends_its_messages_at_its_time(run):
     """)
     # In tens of pixels from the middle: position, movement, and where the stroke began.
     assert strokes == {
-        "remove": [[-1, 0, None], [-1, 0, None], [-1, 2, None], [1, 0, None]],
-        "clump": [[-1, 0, None], [-1, 0, None], [-1, 2, None], [1, 0, None]],
+        **dict.fromkeys(
+            ("wipe", "clump", "noise", "remove"),
+            [[-1, 0, None], [-1, 0, None], [-1, 2, None], [1, 0, None]],
+        ),
         "inject": [[-1, 0, -1], [-1, 0, -1], [-1, 2, -1], [1, 0, -1]],
         "push": [[-1, 0, None], [-1, 2, None]],
         "graft": [[-1, 0, None], [1, 0, None]],
         "add": [[-1, 0, None]],
         "cut": [[-1, 2, None]],
     }
+
+
+def test_a_page_begins_with_a_brush_that_heals_and_says_what_it_does(run):
+    shown = run("""
+        const first = [page.brushes.chosen.name, element("hint").textContent];
+        const keys = element("brushes").children;
+        const press = (key) =>
+          page.controls.key({ key, target: { matches: () => false }, preventDefault() {} });
+        press("0");
+        const last = [page.brushes.chosen.name, element("hint").textContent];
+        listen({ ...world, dimension: 3 });
+        return [first, keys.length, last, page.brushes.chosen.name];
+    """)
+    removing = "Remove: takes particles away, for good"
+    wiping = "Wipe: sets states to zero; the world heals it"
+    assert shown == [["wipe", wiping], 10, ["remove", removing], "look"]
+
+
+def test_all_that_a_page_shows_has_a_meaning(run):
+    shows = [*shows_of(2), "state 15"]
+    meanings = run(f"""
+        return {json.dumps(shows)}.map((show) => {{
+          listen({{ ...world, show }});
+          return element("meaning").textContent;
+        }});
+    """)
+    assert min(map(len, meanings)) > 20
+    assert len(set(meanings)) == len(shows) - 2
+
+
+def test_loading_is_shown_until_the_first_frame_of_a_world(run):
+    states = run("""
+        const hidden = () => element("loading").hidden;
+        const states = [hidden()];
+        listen(frame(1));
+        tick();
+        states.push(hidden());
+        listen({ ...world, half_width: 2 });
+        return [...states, hidden()];
+    """)
+    assert states == [False, True, False]
 
 
 def test_the_key_f_shows_the_whole_world(run):
@@ -100,7 +144,8 @@ def test_the_key_f_shows_the_whole_world(run):
 def test_a_recording_ends_by_its_button_or_the_engine_and_not_by_the_film_before(run):
     states = run("""
         const { film } = page, button = element("record");
-        const state = () => [film.recording !== null, button.textContent, ofType("film").length];
+        const state = () => [film.recording !== null, button.textContent, ofType("film").length,
+          element("writing").hidden];
         film.record(true);
         film.record(false);
         film.record(true);
@@ -112,7 +157,9 @@ def test_a_recording_ends_by_its_button_or_the_engine_and_not_by_the_film_before
         listen({ type: "film", action: "stop" });
         return [...states, state()];
     """)
-    assert states == [[True, "Stop", 3], [False, "Record", 4], [False, "Record", 5]]
+    assert states == [
+        [True, "Stop", 3, True], [False, "Record", 4, False], [False, "Record", 5, False]
+    ]  # fmt: skip
 
 
 @pytest.mark.parametrize(

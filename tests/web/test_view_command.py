@@ -63,6 +63,7 @@ def test_environments_of_ones_own_are_viewed(tmp_path, monkeypatch):
     ("words", "error"),
     [
         (["worm"], "unknown rule 'worm'"), (["npa/Worm-v0"], "unknown environment 'npa/Worm-v0'"),
+        (["grid"], "grid is a target, and no rule for it is shipped"),
         (["no_module:Worm-v0"], "unknown environment 'no_module:Worm-v0'"),
         (["CartPole-v1"], "env must be an environment of npa_envs, got 'CartPole-v1'"),
         (["npa/Texture-v0", "--policy", "duck"], "the environment's space_dim, 2, got 3"),

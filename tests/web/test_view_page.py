@@ -109,7 +109,13 @@ def test_the_world_moves_the_brush_removes_and_a_slider_changes_eps(shown, tmp_p
     pause(page)
     middle = positions(page).mean(axis=0)
     assert nearest(page, *middle) < 0.1
-    page.drag([pixel_of(page, *middle)] * 3)
+    place = [pixel_of(page, *middle)] * 3
+    # The first brush wipes: no particle is lost.
+    page.drag(place)
+    click(page, "one")
+    page.wait(f"!document.page.world.playing && {FRAME}.positions.length === 512")
+    take(page, "remove")
+    page.drag(place)
     page.wait(f"{FRAME}.positions.length < 512")
     # The brush of 0.1 was there.
     assert nearest(page, *middle) > 0.1
@@ -131,7 +137,7 @@ def test_the_world_moves_the_brush_removes_and_a_slider_changes_eps(shown, tmp_p
 def test_every_brush_and_every_show_works(shown):
     page, _ = shown(count=512)
     page.wait(f"{FRAME}.step > 20")
-    for brush in ("push", "clump", "cut", "inject", "graft", "add"):
+    for brush in ("wipe", "cut", "push", "clump", "noise", "inject", "graft", "add"):
         take(page, brush)
         page.drag([pixel_of(page, x, 0.0) for x in (-0.2, -0.1, 0.0, 0.1, 0.2)])
         time.sleep(0.3)
@@ -190,6 +196,7 @@ def test_on_a_phone_fingers_brush_and_the_settings_fold(shown):
         assert (left >= 0, right <= PHONE[0], bottom <= PHONE[1], size >= 40) == (True,) * 4
     pause(page)
     middle = positions(page).mean(axis=0)
+    take(page, "remove")
     page.touch([pixel_of(page, *middle)] * 2)
     page.wait(f"{FRAME}.positions.length < 512")
     click(page, "fold")

@@ -44,6 +44,15 @@ export function push(world, centre, move, radius, strength) {
   });
 }
 
+// Moves particles by their offsets at the centre, less towards the rim.
+export function scatter(world, centre, radius, offsets) {
+  const { x, dimension } = world;
+  forEach(world, centre, (i, _, square) => {
+    const weight = softness(square, radius);
+    for (let k = i * dimension; k < (i + 1) * dimension; k++) x[k] += weight * offsets[k];
+  });
+}
+
 // Returns the weighted mean state of particles in a ball, heavier towards the centre; null without any.
 export function stateAround(world, centre, radius) {
   const { s, channels } = world, mean = new Float64Array(channels);

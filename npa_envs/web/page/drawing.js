@@ -125,7 +125,7 @@ function tiles(scene, width, height) {
   if (!box || dimension !== 2) return [[0, 0, 0]];
   const unit = camera.unit(width, height);
   const range = (size, side, middle) => {
-    const half = (size * unit) / 2;
+    const half = (size * unit) / 2 + SOFT_REACH * scene.spot;
     const first = Math.round((middle - half) / side), last = Math.round((middle + half) / side);
     return Array.from({ length: Math.min(last - first + 1, 8) }, (_, k) => (first + k) * side);
   };
@@ -166,7 +166,7 @@ precision mediump float;
 in vec3 tint; in float light; out vec4 sum;
 void main() {
   vec2 r = 2.0 * gl_PointCoord - 1.0;
-  float weight = exp(-3.9 * dot(r, r)) - 0.02;
+  float weight = exp(-5.12 * dot(r, r)) - 0.006;
   sum = weight > 0.0 ? vec4(tint, 1.0) * weight : vec4(0.0);
 }`;
 
@@ -182,7 +182,7 @@ precision mediump float;
 in vec2 at; uniform sampler2D sums; uniform vec3 background; out vec4 shown;
 void main() {
   vec4 sum = texture(sums, at);
-  float cover = 1.0 - exp(-2.4 * sum.a);
+  float cover = smoothstep(0.06, 0.3, sum.a);
   shown = vec4(mix(background, sum.rgb / max(sum.a, 1e-3), cover), 1.0);
 }`;
 
@@ -220,8 +220,10 @@ precision mediump float;
 in float cover; uniform vec3 ink; out vec4 shown;
 void main() { shown = vec4(ink * cover, cover); }`;
 
-const SOFT_REACH = 2.8; // standard deviations of a soft spot that are drawn
-const BUFFER_SPOT = 2.2; // standard deviation of a soft spot in the buffer of sums [pixels], at most
+// Sums of soft spots cover the background from a sixth of a spot on, so that edges are crisp and bodies without gaps.
+const SOFT_WIDTH = 0.62; // standard deviation of a soft spot, in those of the scene's spots
+const SOFT_REACH = 3.2; // standard deviations of a soft spot that are drawn
+const BUFFER_SPOT = 1.6; // standard deviation of a soft spot in the buffer of sums [pixels], at most
 
 class GlPainter {
   constructor(gl) {
@@ -244,8 +246,8 @@ class GlPainter {
   draw(scene) {
     const gl = this.gl, width = gl.drawingBufferWidth, height = gl.drawingBufferHeight;
     const { dimension, positions, colours, background, camera } = scene;
-    const pixels = scene.spot / camera.unit(width, height);
     const soft = this.sums && dimension === 2 && scene.look === "soft";
+    const pixels = (scene.spot * (soft ? SOFT_WIDTH : 1)) / camera.unit(width, height);
     const shrink = soft ? Math.min(1, BUFFER_SPOT / pixels) : 1;
     gl.disable(gl.DEPTH_TEST);
     gl.enable(gl.BLEND);
@@ -361,9 +363,12 @@ function linked(gl, vertex, fragment) {
   return linkedProgram;
 }
 
-const PLAIN_PIXELS = [360, 1200]; // on the longer side of the small picture, least and most
-const PLAIN_TIME = 10; // milliseconds that a picture may take
-const COVERS = Float32Array.from({ length: 1024 }, (_, k) => 1 - Math.exp(-2.4 * (k / 256)));
+const PLAIN_PIXELS = [640, 1200]; // on the longer side of the small picture, least and most
+const PLAIN_TIME = 16; // milliseconds that a picture may take
+const COVERS = Float32Array.from({ length: 1024 }, (_, k) => {
+  const rise = Math.min(1, Math.max(0, (k / 1024 - 0.06) / 0.24));
+  return rise * rise * (3 - 2 * rise);
+});
 
 // Without WebGL: spots are written into a picture, as large as time allows, and stretched to the canvas.
 class PlainPainter {
@@ -371,7 +376,7 @@ class PlainPainter {
     this.context = context;
     this.kind = "canvas";
     this.small = document.createElement("canvas");
-    this.pixels = 480;
+    this.pixels = PLAIN_PIXELS[0];
   }
 
   draw(scene) {
@@ -381,18 +386,21 @@ class PlainPainter {
     const across = Math.ceil(width * shrink), down = Math.ceil(height * shrink);
     if (small.width !== across || small.height !== down) {
       Object.assign(small, { width: across, height: down });
-      this.sums = new Float32Array(4 * across * down);
       this.picture = small.getContext("2d").createImageData(across, down);
     }
-    this.sums.fill(0);
     const soft = scene.dimension === 2 && scene.look === "soft";
-    const spot = scene.spot / scene.camera.unit(across, down);
-    for (const offset of tiles(scene, across, down)) {
-      const spots = projected(scene, offset, across, down);
-      if (soft) addSpots(this.sums, across, down, spots, scene.colours, Math.max(spot, 0.6));
-      else addBalls(this.sums, across, down, spots, scene, Math.max(spot, 0.5));
+    const spot = (scene.spot * (soft ? SOFT_WIDTH : 1)) / scene.camera.unit(across, down);
+    const coarse = soft ? Math.min(1, BUFFER_SPOT / spot) : 1;
+    const columns = Math.ceil(across * coarse), rows = Math.ceil(down * coarse);
+    if (this.sums?.length !== 4 * columns * rows) this.sums = new Float32Array(4 * columns * rows);
+    this.sums.fill(0);
+    for (const offset of tiles(scene, columns, rows)) {
+      const spots = projected(scene, offset, columns, rows);
+      if (soft) addSpots(this.sums, columns, rows, spots, scene.colours, Math.max(coarse * spot, 0.6));
+      else addBalls(this.sums, columns, rows, spots, scene, Math.max(spot, 0.5));
     }
-    show(this.picture.data, this.sums, scene.background, soft);
+    if (soft) showSoft(this.picture, this.sums, columns, rows, scene.background);
+    else showBalls(this.picture.data, this.sums, scene.background);
     small.getContext("2d").putImageData(this.picture, 0, 0);
     context.imageSmoothingEnabled = true;
     context.imageSmoothingQuality = "low";
@@ -441,7 +449,7 @@ function projected({ positions, dimension, camera }, offset, width, height) {
 
 // Adds soft spots: sums of colours and of weights. They end round, where they are faint.
 function addSpots(sums, width, height, spots, colours, spot) {
-  const extent = 2.4 * spot, fall = -0.5 / (spot * spot), faint = Math.exp(-0.5 * 2.4 ** 2);
+  const extent = SOFT_REACH * spot, fall = -0.5 / (spot * spot), faint = Math.exp(-0.5 * SOFT_REACH ** 2);
   const weights = new Float32Array(2 * Math.ceil(extent) + 2);
   for (let k = 0; k < spots.length / 4; k++) {
     const column = spots[4 * k], row = spots[4 * k + 1];
@@ -490,14 +498,35 @@ function addBalls(sums, width, height, spots, { colours, dimension, camera }, sp
   }
 }
 
-function show(data, sums, background, soft) {
+// Stretches sums to the picture, by linear interpolation.
+function showSoft({ data, width, height }, sums, columns, rows, background) {
+  const pixels = new Uint32Array(data.buffer), line = new Float32Array(4 * (columns + 1));
   const [red, green, blue] = background.map((v) => 255 * v), full = COVERS.length - 1;
+  const colour = (r, g, b) => (255 << 24) | (b << 16) | (g << 8) | r, bare = colour(red, green, blue);
+  const place = (pixel, size, count) => Math.min(count - 1, Math.max(0, ((pixel + 0.5) * count) / size - 0.5));
+  const places = Float32Array.from({ length: width }, (_, x) => place(x, width, columns));
+  for (let y = 0, p = 0; y < height; y++) {
+    const at = place(y, height, rows), down = at % 1;
+    const above = 4 * columns * Math.floor(at), below = 4 * columns * Math.min(rows - 1, Math.floor(at) + 1);
+    for (let k = 0; k < 4 * columns; k++) line[k] = sums[above + k] + down * (sums[below + k] - sums[above + k]);
+    for (let x = 0; x < width; x++, p++) {
+      const column = places[x] | 0, next = places[x] - column, rest = 1 - next, l = 4 * column;
+      const weight = rest * line[l + 3] + next * line[l + 7], cover = COVERS[Math.min(full, (weight * 1024) | 0)];
+      if (cover === 0) pixels[p] = bare;
+      else {
+        const part = 1 - cover, near = (rest * cover) / weight, far = (next * cover) / weight;
+        pixels[p] = colour(
+          part * red + near * line[l] + far * line[l + 4], part * green + near * line[l + 1] + far * line[l + 5],
+          part * blue + near * line[l + 2] + far * line[l + 6]);
+      }
+    }
+  }
+}
+
+function showBalls(data, sums, background) {
+  const ground = background.map((v) => 255 * v);
   for (let p = 0; p < sums.length; p += 4) {
-    const weight = sums[p + 3], scale = soft ? 1 / Math.max(weight, 1e-3) : 1;
-    const cover = soft ? COVERS[Math.min(full, (weight * 256) | 0)] : weight > 0 ? 1 : 0;
-    data[p] = red + cover * (sums[p] * scale - red);
-    data[p + 1] = green + cover * (sums[p + 1] * scale - green);
-    data[p + 2] = blue + cover * (sums[p + 2] * scale - blue);
+    for (let c = 0; c < 3; c++) data[p + c] = sums[p + 3] > 0 ? sums[p + c] : ground[c];
     data[p + 3] = 255;
   }
 }

@@ -12,12 +12,25 @@ const BLANK = {
 };
 
 // The page's own brush, before those of the world: it sends no messages.
-const LOOK = { name: "look", label: "Look: drag to move, wheel or pinch to zoom, double click to see all" };
+const LOOK = { name: "look", label: "Look: drag to move or turn, wheel or pinch to zoom" };
+
+// What colours mean, by the names of `shows_of` of live_world.py, those of state channels without their number.
+const MEANINGS = {
+  colours: "The particles' own colours: the picture, or the class that each names.",
+  density: "How crowded it is around a particle, from dark to bright.",
+  components: "The three directions in which states differ most, as red, green and blue: like colour, like state.",
+  species: "Which rule a particle follows.",
+  speed: "How far a particle moved in the last step, from dark to bright.",
+  mask: "Which particles the last step updated (yellow): each with probability p.",
+  state: "One channel of the states: blue below zero, grey at zero, orange above.",
+};
 
 // SVG paths on a square of side 24, by the names of brushes and controls.
 const ICONS = {
   look: "M12 5v14M5 12h14M12 5l-2 2M12 5l2 2M12 19l-2-2M12 19l2-2M5 12l2-2M5 12l2 2M19 12l-2-2M19 12l-2 2",
-  remove: "M4 15l8-9 7 6-7 8H8zM9 20h11",
+  wipe: "M4 15l8-9 7 6-7 8H8zM9 20h11M8 10.5l7 6",
+  noise: ["6 6", "13 4.5", "19 8", "9.5 11", "15.5 13", "4.5 15.5", "11 18", "18.5 18.5"].map((at) => `M${at}h.01`).join(""),
+  remove: "M4 7h16M9 7V4.5h6V7M6.5 7l1 13h9l1-13M10 11v5.5M14 11v5.5",
   push: "M12 20c-4 0-6-3-7-7 2-1 3 0 4 2V6a1.4 1.4 0 0 1 3 0v5a1.4 1.4 0 0 1 3 0v1a1.4 1.4 0 0 1 3 0v3c0 3-2 5-6 5z",
   clump: "M4 4l5 5M20 4l-5 5M4 20l5-5M20 20l-5-5M9 6v3H6M15 6v3h3M9 18v-3H6M15 18v-3h3",
   cut: "M5 19L19 5M6 8a2 2 0 1 0 0-.1M16 18a2 2 0 1 0 0-.1M8 9l8 8",
@@ -36,8 +49,9 @@ const QUALITY = 0.92;
 
 const $ = (name) => document.getElementById(name);
 
-function icon(name) {
-  return `<svg viewBox="0 0 24 24" aria-hidden="true"><path d="${ICONS[name]}"/></svg>`;
+// An icon with a word below it.
+function icon(name, word) {
+  return `<svg viewBox="0 0 24 24" aria-hidden="true" class="${name}"><path d="${ICONS[name]}"/></svg><span>${word}</span>`;
 }
 
 // Starts the page, which is also `document.page`, for the console. `connect(settings, listener)` returns a promise of
@@ -100,9 +114,10 @@ class Page {
     if (!this.described || before.dimension !== world.dimension || before.half_width !== world.half_width) {
       this.camera = new Camera(world.dimension, world.half_width, world.centre);
       this.frame = null;
+      $("loading").hidden = false;
       // Also for undrawn frames of the former world: the engine waits for each.
       this.reportDrawn();
-      const first = world.dimension === 2 ? "remove" : "look", { name: chosen } = this.brushes.chosen;
+      const first = world.dimension === 2 ? world.tools[0]?.name : "look", { name: chosen } = this.brushes.chosen;
       const keeps = before.dimension === world.dimension && world.tools.some(({ name }) => name === chosen);
       this.brushes.choose(keeps ? chosen : first);
     }
@@ -124,6 +139,7 @@ class Page {
   }
 
   showError(message) {
+    $("loading").hidden = $("writing").hidden = true;
     $("message").textContent = message;
     $("message").hidden = false;
     clearTimeout(this.messageTimer);
@@ -160,6 +176,7 @@ class Page {
 
   readFrame() {
     const { frame, world } = this, now = performance.now();
+    $("loading").hidden = true;
     if ($("tracers").checked) this.tracers.add(frame.positions, world.dimension);
     this.frameTimes.push(now);
     while (this.frameTimes[0] < now - 2000) this.frameTimes.shift();
@@ -183,8 +200,9 @@ class Page {
     const width = Math.round(canvas.clientWidth * ratio), height = Math.round(canvas.clientHeight * ratio);
     if (!width || !height) return;
     if (canvas.width !== width || canvas.height !== height) Object.assign(canvas, { width, height });
-    // A box may also extend below the bar.
-    camera.covered = world.box ? 0 : (canvas.clientHeight - $("bar").offsetTop) / canvas.clientHeight;
+    // A box may also extend below the bar, and below the panel, which on a phone is above the bar.
+    const edge = Math.min($("bar").offsetTop, $("panel").getBoundingClientRect().top || Infinity);
+    camera.covered = world.box ? 0 : (canvas.clientHeight - edge) / canvas.clientHeight;
     this.painter.draw({
       positions: frame?.positions ?? new Float32Array(), colours: frame?.colours ?? new Uint8Array(),
       dimension: world.dimension, box: world.box, spot: world.spot * $("size").value, camera,
@@ -229,6 +247,7 @@ class Brushes {
     this.chosen = this.offered.find((brush) => brush.name === name) ?? LOOK;
     for (const button of $("brushes").children)
       button.setAttribute("aria-checked", String(button.dataset.brush === this.chosen.name));
+    $("hint").textContent = this.chosen.label;
     if (this.chosen === LOOK) $("cursor").hidden = true;
     this.canvas.style.cursor = this.chosen === LOOK ? "grab" : "crosshair";
   }
@@ -359,7 +378,8 @@ class Controls {
   constructor(page) {
     this.page = page;
     this.pressing = false; // whether a slider is pressed
-    for (const name of ["one", "reset", "fold"]) $(name).innerHTML = icon(name);
+    for (const [name, word] of [["one", "Step"], ["reset", "New"], ["fold", "Settings"]])
+      $(name).innerHTML = icon(name, word);
     $("play").onclick = () => page.play(!page.world.playing);
     $("one").onclick = () => { page.play(false); page.send({ type: "step" }); };
     $("reset").onclick = () => page.send({ type: "reset" });
@@ -395,11 +415,12 @@ class Controls {
       ? $("other").value : world.others.find((name) => name !== world.rule);
     options($("other"), world.others, other);
     options($("show"), world.shows, world.show);
+    $("meaning").textContent = MEANINGS[world.show.split(" ")[0]];
     $("rule-field").hidden = world.rules.length < 2;
     $("other-field").hidden = !world.tools.some(({ takes }) => takes === "rule");
     $("brush").hidden = !world.tools.length;
     this.showBrushes();
-    $("damages").hidden = !world.damages.length;
+    $("damage").hidden = !world.damages.length;
     $("damages").replaceChildren(...world.damages.map((name) => make("button", {
       textContent: name, title: `Damage: ${name}`, onclick: () => this.page.send({ type: "damage", name }),
     })));
@@ -412,11 +433,12 @@ class Controls {
 
   fold(away) {
     $("panel").hidden = away;
+    this.page.dirty = true;
     $("fold").setAttribute("aria-expanded", String(!away));
   }
 
   showPlaying() {
-    $("play").innerHTML = icon(this.page.world.playing ? "pause" : "play");
+    $("play").innerHTML = this.page.world.playing ? icon("pause", "Pause") : icon("play", "Play");
     $("play").setAttribute("aria-pressed", String(this.page.world.playing));
   }
 
@@ -429,16 +451,15 @@ class Controls {
   }
 
   showBrushes() {
-    const { brushes } = this.page, names = brushes.offered.map(({ name }) => name).join();
+    const { brushes } = this.page, names = brushes.offered.map(({ label }) => label).join();
     if ($("brushes").dataset.names === names) return;
     $("brushes").dataset.names = names;
     $("brushes").replaceChildren(...brushes.offered.map(({ name, label }, k) => {
       const button = make("button", {
-        innerHTML: icon(name), title: `${label} (${k + 1})`, onclick: () => brushes.choose(name),
+        innerHTML: icon(name, wordOf(label)), title: `${label} (${(k + 1) % 10})`, onclick: () => brushes.choose(name),
       });
       button.dataset.brush = name;
       button.setAttribute("role", "radio");
-      button.setAttribute("aria-label", name);
       return button;
     }));
     brushes.choose(brushes.chosen.name);
@@ -473,7 +494,7 @@ class Controls {
       " ": () => this.page.play(!this.page.world.playing), s: () => $("one").click(), r: () => $("reset").click(),
       p: () => $("fold").click(), f: () => this.page.fit(),
     };
-    const act = acts[event.key] ?? $("brushes").children[+event.key - 1]?.onclick;
+    const act = acts[event.key] ?? $("brushes").children[(+event.key + 9) % 10]?.onclick;
     if (!act || (event.key === " " && event.target.matches("button, summary"))) return;
     event.preventDefault();
     act();
@@ -492,6 +513,9 @@ class Film {
     item.append(link);
     $("files").prepend(item);
     $("film").open = true;
+    $("writing").hidden = true;
+    this.page.controls.fold(false);
+    item.scrollIntoView({ block: "center" });
     return link;
   }
 
@@ -506,6 +530,7 @@ class Film {
   // Sends pictures to an engine that makes films; else the browser records the canvas.
   record(on) {
     this.showRecording(on);
+    $("writing").hidden = on;
     if (!on) {
       this.recording.stop();
       this.recording = null;
@@ -524,7 +549,9 @@ class Film {
 
   // Ends a recording whose film the engine has ended.
   end() {
-    if (this.recording?.picture) this.showRecording((this.recording = null));
+    if (!this.recording?.picture) return;
+    this.showRecording((this.recording = null));
+    $("writing").hidden = false;
   }
 
   // Adds the canvas to the film, if one is being recorded for the engine.
@@ -547,6 +574,11 @@ function recorder(canvas, done) {
   media.onstop = () => done(`film.${type.slice(6)}`, URL.createObjectURL(new Blob(chunks, { type })));
   media.start(500);
   return { stop: () => media.stop() };
+}
+
+// The word of a brush's label, before the colon.
+function wordOf(label) {
+  return label.split(":")[0];
 }
 
 function options(select, names, chosen) {

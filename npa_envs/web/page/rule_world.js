@@ -1,7 +1,7 @@
 // The world of an exported page, which follows RuleWorld of npa_envs/web/rule_world.py. npa_envs/web/messages.py has
 // its messages and events.
 
-import { clump, cut, cutAlong, wipeState, inject, insideBall, push, stateAround } from "./brushes.js";
+import { clump, cut, cutAlong, wipeState, inject, insideBall, push, scatter, stateAround } from "./brushes.js";
 import { Colouring, RuleColours } from "./colours.js";
 import { fastestKernels } from "./kernels_simd.js";
 import { padded, Physics, prepareRule, wrap } from "./physics.js";
@@ -18,6 +18,9 @@ const TRIAL_TOLERANCE = 1e-3;
 // "brush", whose `strength` has become an `amount`. tests/web/test_export.py compares them with RuleWorld's:
 // test_brushes_of_a_page_are_those_of_the_viewer.
 const BRUSHES = {
+  wipe: ({ world }, { at, radius }) => wipeState(world, at, radius),
+  noise: ({ world, random }, { at, radius, amount }) =>
+    scatter(world, at, radius, random.normals(world.x.length, amount * radius)),
   remove(live, { at, radius }) {
     const removed = new Set(insideBall(live.world, at, radius));
     if (removed.size === 0) return;
