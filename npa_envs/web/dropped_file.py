@@ -69,7 +69,9 @@ def read_dropped(path: Path, *, whole: bool = False) -> None:
     if path.name == EMOJI:
         text = path.read_text(encoding="utf-8", errors="replace")
         if not is_emoji(text) or looks_like_path(text):
-            raise NPAError(f"an emoji must be one picture symbol, got {shown(text)}: try \U0001f98a")
+            raise NPAError(
+                f"an emoji must be one picture symbol, got {shown(text)}: try \U0001f98a"
+            )
         image = render_emoji(text)
     else:
         image = with_background(open_image(path)) if whole else read_image(path)

@@ -16,16 +16,19 @@ export class TrainingCard {
     this.psnr = null; // of the world that is shown [dB]
     this.upload = null; // what was uploaded last, for another try
     this.showing = ""; // the id of the training whose world is shown
+    this.stopping = ""; // the id of the training that the user has stopped
     this.open = false;
+    this.choosing = false; // whether to choose another one, where one is learned already
     this.refusal = ""; // why the server did not take the last upload
   }
 
   listen(event) {
     if (event.type === "psnr") this.psnr = event.value;
     else if (event.type === "training") {
-      this.event = event;
       if (!this.card) this.build();
-      if (ACTIVE.includes(event.state)) this.open = true;
+      // A tab learns of a training once, and may then fold the card.
+      if (ACTIVE.includes(event.state) && event.id !== this.event?.id) this.open = true;
+      this.event = event;
       const mine = sessionStorage.getItem(MINE) === event.id;
       if (event.has_rule && mine && this.showing !== event.id) this.show();
     } else return;
@@ -62,6 +65,7 @@ export class TrainingCard {
     const name = content.name ?? content;
     this.upload = content;
     this.open = true;
+    this.choosing = false;
     this.refusal = "";
     if (content.size > this.event.limit) {
       this.refusal = `${name} has ${Math.ceil(content.size / 2 ** 20)} MiB, at most ` +
@@ -100,7 +104,8 @@ export class TrainingCard {
 
   render() {
     const { event } = this, active = ACTIVE.includes(event.state);
-    const shown = !this.open ? "closed" : active ? "active" : event.has_rule ? "learned" : "empty";
+    const learned = event.has_rule && !this.choosing;
+    const shown = !this.open ? "closed" : active ? "active" : learned ? "learned" : "empty";
     const parts = { closed: this.closed, active: this.active, learned: this.learned, empty: this.chooser };
     // Not made anew while one types.
     if (shown !== this.shown || shown !== "empty" || this.problem !== this.problemShown)
@@ -115,12 +120,22 @@ export class TrainingCard {
     return this.refusal || (this.event.state === "failed" ? this.event.message : "");
   }
 
+  // Offers to choose again, beside what is learned already.
+  another() {
+    this.choosing = true;
+    this.render();
+  }
+
   closed() {
-    return [button("Grow your own picture", () => this.unfold(true))];
+    const { state, name, iteration = 0, total = Infinity, has_rule: learned } = this.event;
+    const share = `Learning ${name}: ${Math.floor((100 * iteration) / total)} %`;
+    const label = ACTIVE.includes(state) ? share : learned ? name : "Grow your own picture";
+    return [button(label, () => this.unfold(true))];
   }
 
   unfold(open) {
     this.open = open;
+    this.choosing = false;
     this.render();
   }
 
@@ -139,19 +154,23 @@ export class TrainingCard {
   }
 
   active() {
-    const { name, state, iteration = 0, total, seconds_left: left } = this.event;
+    const { id, name, state, iteration = 0, total, seconds_left: left } = this.event;
     const bar = make("progress", { max: total ?? 1 });
     if (total) bar.value = iteration;
     const words = {
       reading: "Reading the file…", starting: "Starting the training…",
       learning: `Iteration ${iteration} of ${total}${left === undefined ? "" : `, ${duration(left)} left`}`,
     };
-    const watches = this.showing === this.event.id;
+    const stop = () => {
+      this.stopping = id;
+      this.send({ type: "training", action: "stop" });
+      this.render();
+    };
+    const watch = this.showing !== id && this.event.has_rule ? [button("Watch", () => this.show())] : [];
     return [
-      heading(`Learning ${name}`), bar, text(words[state]), ...this.quality(),
-      row(...(watches || !this.event.has_rule ? [] : [button("Watch", () => this.show())]),
-        button("Stop", () => this.send({ type: "training", action: "stop" }))),
-      ...this.problems(),
+      heading(`Learning ${name}`, () => this.unfold(false)), bar,
+      text(this.stopping === id ? "Stopping; what it has learned is saved…" : words[state]),
+      row(...this.quality(), ...watch, button("Stop", stop)), ...this.problems(),
     ];
   }
 
@@ -164,12 +183,11 @@ export class TrainingCard {
     const how = state === "done" ? `Learned in ${duration(seconds)}` : `Stopped at iteration ${iteration} of ${total}`;
     const watches = this.showing === id;
     return [
-      heading(name, () => this.unfold(false)),
-      text(`${how}. Cut it, pull it, wipe a part of it.`), ...this.quality(),
-      row(link("Rule", "rule.safetensors", ".safetensors"), link("Page", "page.html", ".html")),
-      row(watches ? button("Back", () => this.leave()) : button("Watch", () => this.show()),
-        button("Another one", () => this.file.click())),
-      make("p", { className: "path", textContent: `Saved in ${folder}` }), ...this.problems(), this.file,
+      heading(name, () => this.unfold(false)), text(`${how}. Cut it, wipe a part of it.`), ...this.quality(),
+      row(link("Save rule", "rule.safetensors", ".safetensors"), link("Save page", "page.html", ".html"),
+        watches ? button("Back", () => this.leave()) : button("Watch", () => this.show()),
+        button("Another", () => this.another())),
+      make("p", { className: "path", textContent: `The run is in ${folder}` }), ...this.problems(), this.file,
     ];
   }
 
