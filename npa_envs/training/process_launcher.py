@@ -36,10 +36,9 @@ PARENT_GRACE = 10.0
 def end_with_parent() -> None:
     """Let this process end soon after its parent, where `PARENT_PIPE` is in the environment.
 
-    Such a parent starts the process with a pipe as standard input, to which it never writes. When
-    it closes the pipe, or ends in any way, also by SIGKILL, the pipe has no writer. The process
-    then gets SIGTERM, on which a run saves, and is ended after `PARENT_GRACE`. Processes that it
-    starts inherit pipe and variable; those of torch's launcher call this function too.
+    Such a parent starts it with a pipe as standard input, and never writes. When it closes the
+    pipe or ends, also by SIGKILL, this process gets SIGTERM, on which a run saves, and is ended
+    after `PARENT_GRACE`. The processes of torch's launcher inherit pipe and variable.
     """
     if PARENT_PIPE not in os.environ:
         return

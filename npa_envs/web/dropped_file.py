@@ -1,7 +1,7 @@
 """Reads a file that was dropped on a page, in a process of its own with limits.
 
-`python -m npa_envs.web.dropped_file FOLDER NAME [whole]` reads FOLDER/NAME, and writes a picture or
-an emoji that can be learned as FOLDER/picture.png. It prints what the readers print, and the error.
+`python -m npa_envs.web.dropped_file FILE [whole]` writes what is to grow of a picture or an emoji
+as picture.png beside it, or checks a mesh. It prints what the readers print, or the error.
 """
 
 from __future__ import annotations
@@ -94,19 +94,16 @@ def limit_resources() -> None:
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Read FOLDER/NAME within the limits; return 0, or 2 after an error that is printed."""
+    """Read a file within the limits; return 0, or 2 after an error that is printed."""
     end_with_parent()
     limit_resources()
-    folder, name, *options = arguments
     try:
-        read_dropped(Path(folder) / name, whole="whole" in options)
-    except MemoryError:
-        print(f"npa-envs: error: reading it takes more than {MEMORY >> 30} GiB: reduce it")
-    except NPAError as error:
-        print(f"npa-envs: error: {' '.join(str(error).split())}")
-    else:
-        return 0
-    return 2
+        read_dropped(Path(arguments[0]), whole="whole" in arguments[1:])
+    except (NPAError, MemoryError) as error:
+        message = str(error) or f"reading it takes more than {MEMORY >> 30} GiB: reduce it"
+        print(f"npa-envs: error: {' '.join(message.split())}")
+        return 2
+    return 0
 
 
 if __name__ == "__main__":

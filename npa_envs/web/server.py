@@ -169,10 +169,7 @@ def make_app(site: Site) -> Starlette:
         return _file_response(site.films, request, {".gif": "image/gif", ".mp4": "video/mp4"})
 
     async def upload(request: Request) -> Response:
-        """Begin a training: the body is a file, or the keyword `emoji` is set and it is an emoji.
-
-        Keywords are `name` for the file's name, and `whole` to keep a picture's background.
-        """
+        """Begin a training of the body; keywords are those of `Training.begin`."""
         query, headers = request.query_params, request.headers
         if site.training is None or not site.allows_token(query.get("token")):
             return _refused("files are learned by pages of this server, with its token")
@@ -184,11 +181,10 @@ def make_app(site: Site) -> Starlette:
             content += part
             if len(content) > MAX_BYTES:
                 break
-        options = {"emoji": "emoji" in query, "whole": "whole" in query}
+        options = {word: word in query for word in ("emoji", "whole")}
+        name = query.get("name", "")
         try:
-            begun = await run_in_threadpool(
-                site.training.begin, query.get("name", ""), bytes(content), **options
-            )
+            begun = await run_in_threadpool(site.training.begin, name, bytes(content), **options)
         except (NPAError, OSError) as error:
             return PlainTextResponse(str(error), 409 if site.training.active else 400)
         return JSONResponse({"id": begun})

@@ -6,7 +6,6 @@ import contextlib
 import os
 import secrets
 import shutil
-import signal
 import subprocess
 import sys
 import threading
@@ -20,6 +19,7 @@ from torch import Tensor
 
 from npa_envs.atomic_files import made_folder, read_json, write_bytes
 from npa_envs.errors import NPAError
+from npa_envs.measure.quality import psnr
 from npa_envs.tasks.base import Task
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2D
 from npa_envs.tasks.morphogenesis3d import Morphogenesis3D
@@ -31,19 +31,8 @@ from npa_envs.web.export import page_rule, page_text
 from npa_envs.web.messages import TrainingEvent, WorldEvent
 from npa_envs.web.rule_world import RunWorld
 
-MAX_NAME = 80
-"""Maximum number of shown characters of a file's name."""
-
-CHECKPOINT_INTERVAL = {"cpu": 50, "cuda": 200}
-"""Iterations between two checkpoints: a few seconds."""
-
-RATE_RECORDS = 20
-"""Number of the log's last records from which the time that is left is estimated."""
-
-ERROR_PREFIX = "npa-envs: error: "
-
-ACTIVE = ("reading", "starting", "learning")
-"""States of a training whose process runs."""
+CHECKPOINTS = {False: 50, True: 200}
+"""Iterations between two checkpoints without and with CUDA: a few seconds."""
 
 
 class Training:
@@ -73,7 +62,7 @@ class Training:
     @property
     def active(self) -> bool:
         """Whether a file is being read or learned."""
-        return self._report["state"] in ACTIVE
+        return self._report["state"] in ("reading", "starting", "learning")
 
     @property
     def slows_worlds(self) -> bool:
@@ -83,16 +72,11 @@ class Training:
     def begin(self, name: str, content: bytes, *, emoji: bool = False, whole: bool = False) -> str:
         """Begin to read and learn a file, and return the run's id.
 
-        Args:
-            name: The file's name; it is shown, and its suffix tells meshes from pictures.
-            content: The file's bytes, or an emoji in UTF-8.
-            emoji: Whether it is an emoji.
-            whole: Whether a picture keeps its background.
-
-        Raises:
-            NPAError: Another training runs, or the file is empty, too large or cannot be stored.
+        The name is shown, and its suffix tells meshes from pictures. The content is the file's, or
+        with `emoji` an emoji in UTF-8. With `whole` a picture keeps its background. NPAError if
+        another training runs, or the file is empty, too large or cannot be stored.
         """
-        shown_name = "".join(c for c in name if c.isprintable())[:MAX_NAME].strip() or "picture"
+        shown_name = "".join(c for c in name if c.isprintable())[:80].strip() or "picture"
         with self._lock:
             if self.active:
                 raise NPAError(
@@ -159,38 +143,32 @@ class Training:
     def _run(self, stored: Path, whole: bool) -> None:
         try:
             self._read_and_learn(stored, whole)
-        except (NPAError, OSError) as error:
+        except Exception as error:
             message = str(error).replace(str(stored), self._report["name"])
             if "keep_background" in message and not whole:
                 self._set(cure="whole")
             self._set(state="failed", message=message)
-        except BaseException:
-            self._set(state="failed", message="the server has an error: see its output")
-            raise
         if not self._report["has_rule"]:
             shutil.rmtree(stored.parent, ignore_errors=True)
 
     def _read_and_learn(self, stored: Path, whole: bool) -> None:
         folder = stored.parent
-        options = ["whole"] if whole else []
-        words = ["npa_envs.web.dropped_file", str(folder), stored.name, *options]
+        words = ["npa_envs.web.dropped_file", str(stored), *(["whole"] if whole else [])]
         output = self._call(words, folder, "reading the file", seconds=READ_SECONDS)
         if self._stopping.is_set():
             return self._set(state="stopped")
-        self._set(state="starting", note=output.strip())
+        self._set(state="starting", note=output.replace(str(stored), self._report["name"]).strip())
         flat = (folder / PICTURE).exists()
         task = "morphogenesis2d" if flat else "morphogenesis3d"
-        target = str(stored)
-        if flat:
-            target = stored.read_text("utf-8") if stored.name == EMOJI else str(folder / PICTURE)
-        cuda = self._device.startswith("cuda")
+        target = folder / PICTURE if flat else stored
+        text = stored.read_text("utf-8") if stored.name == EMOJI else target
+        cuda = self._device != "cpu"
         best = cuda and "best" in task_entry(task).presets
-        interval = CHECKPOINT_INTERVAL["cuda" if cuda else "cpu"]
         self._call(
             [
-                "npa_envs", "train", task, f"--target={target}", f"--out={folder}",
+                "npa_envs", "train", task, f"--target={text}", f"--out={folder}",
                 f"--preset={self._preset or ('best' if best else 'fast')}",
-                f"--device={self._device}", f"--checkpoint-interval={interval}",
+                f"--device={self._device}", f"--checkpoint-interval={CHECKPOINTS[cuda]}",
                 "--picture-interval=0", "--no-tensorboard", "--no-progress", "--no-report",
                 *(["--keep-background"] if whole and flat else []),
             ],
@@ -225,13 +203,14 @@ class Training:
         finally:
             end_process(process)
         output = path.read_text("utf-8", errors="replace")
-        errors = [line for line in output.splitlines() if line.startswith(ERROR_PREFIX)]
         if process.returncode and not self._stopping.is_set():
-            code = process.returncode
-            end = f"by {signal.Signals(-code).name}" if code < 0 else f"with code {code}"
-            memory = ", often for lack of memory" if code == -9 else ""
-            why = f"{what} was ended {end}{memory}: see {path}, or try a smaller file"
-            raise NPAError(errors[-1].removeprefix(ERROR_PREFIX) if errors else why)
+            _, found, error = output.rpartition("npa-envs: error: ")
+            raise NPAError(
+                error.strip()
+                if found
+                else f"{what} ended with code {process.returncode} (-9 is "
+                f"often a lack of memory): see {path}, or try a smaller file"
+            )
         return output
 
     def _look(self, folder: Path) -> None:
@@ -244,16 +223,15 @@ class Training:
             total = config["iterations"] * config["repeats"]
             self._set(state="learning", has_rule=True, iteration=0, total=total)
         with contextlib.suppress(NPAError):  # A line that is being written.
-            records = JsonlLog(run.log).records()[-RATE_RECORDS:]
+            # The last ones say how long the rest takes.
+            records = JsonlLog(run.log).records()[-20:]
             if records:
                 first, last = records[0], records[-1]
-                self._set(iteration=last["iteration"], loss=last["loss"], seconds=last["seconds"])
-                if len(records) > 1:
-                    rate = (last["seconds"] - first["seconds"]) / (
-                        last["iteration"] - first["iteration"]
-                    )
-                    left = self._report["total"] - last["iteration"]
-                    self._set(seconds_left=round(rate * left, 1))
+                self._set(**{name: last[name] for name in ("iteration", "loss", "seconds")})
+            if len(records) > 1:
+                done, seconds = (last[name] - first[name] for name in ("iteration", "seconds"))
+                left = self._report["total"] - last["iteration"]
+                self._set(seconds_left=round(seconds / done * left, 1))
 
 
 def end_process(process: subprocess.Popen[bytes]) -> None:
@@ -281,12 +259,7 @@ to where later ones never are."""
 
 
 class LearningWorld(RunWorld):
-    """The world of a run that learns, which begins again with later rules, and its PSNR.
-
-    Args:
-        training: The training, whose latest run is shown.
-        device: Where the world runs.
-    """
+    """The world of the latest run of a training, which begins again with later rules."""
 
     def __init__(self, training: Training, *, device: torch.device) -> None:
         self._training = training
@@ -338,5 +311,5 @@ def psnr_on_white(task: Task, x: Tensor, s: Tensor) -> Tensor:
     pictures = torch.cat((fine.picture(x, s), fine.target_picture[None]))
     # Where spots overlap, densities exceed 1, and colours are means.
     rgb = pictures[..., :3] / pictures[..., 3:].clamp_min(1.0)
-    rgb = (rgb + 1.0 - pictures[..., 3:].clamp(0.0, 1.0)).clamp(0.0, 1.0)
-    return -10.0 * (rgb[:-1] - rgb[-1:]).square().mean(dim=(1, 2, 3)).log10().mean()
+    rgb = rgb + 1.0 - pictures[..., 3:].clamp(0.0, 1.0)
+    return psnr(rgb[:-1], rgb[-1:]).mean()

@@ -84,7 +84,7 @@ def wait_until(condition, seconds=300.0):
 
 def processes_of(folder: Path) -> list[str]:
     """The processes that have a folder in their arguments."""
-    lines = subprocess.check_output(["ps", "-eo", "pid=,stat=,args="], text=True).splitlines()
+    lines = subprocess.check_output(["ps", "-ewwo", "pid=,stat=,args="], text=True).splitlines()
     return [line for line in lines if str(folder) in line and line.split()[1][0] != "Z"]
 
 

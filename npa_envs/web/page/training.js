@@ -63,17 +63,12 @@ export class TrainingCard {
   // Uploads a file, or an emoji as text. `options` are keywords of the server's `upload`.
   async take(content, options = {}) {
     const name = content.name ?? content;
-    this.upload = content;
-    this.open = true;
-    this.choosing = false;
-    this.refusal = "";
-    if (content.size > this.event.limit) {
-      this.refusal = `${name} has ${Math.ceil(content.size / 2 ** 20)} MiB, at most ` +
-        `${this.event.limit / 2 ** 20} are taken: give a smaller file`;
-      return this.render();
-    }
+    Object.assign(this, { upload: content, open: true, choosing: false, refusal: "" });
     if (typeof content === "string") options.emoji = "1";
     try {
+      const mib = (size) => Math.ceil(size / 2 ** 20), { limit } = this.event;
+      if (content.size > limit)
+        throw Error(`${name} has ${mib(content.size)} MiB, at most ${mib(limit)} are taken: give a smaller file`);
       const answer = await fetch(this.address("training", { name, ...options }), { method: "POST", body: content });
       if (!answer.ok) throw Error(await answer.text());
       sessionStorage.setItem(MINE, (await answer.json()).id);
@@ -96,10 +91,9 @@ export class TrainingCard {
   }
 
   leave() {
-    this.showing = "";
     sessionStorage.removeItem(MINE);
     this.send({ type: "training", action: "leave" });
-    this.render();
+    this.change({ showing: "" });
   }
 
   render() {
@@ -107,12 +101,18 @@ export class TrainingCard {
     const learned = event.has_rule && !this.choosing;
     const shown = !this.open ? "closed" : active ? "active" : learned ? "learned" : "empty";
     const parts = { closed: this.closed, active: this.active, learned: this.learned, empty: this.chooser };
-    // Not made anew while one types.
-    if (shown !== this.shown || shown !== "empty" || this.problem !== this.problemShown)
-      this.card.replaceChildren(...parts[shown].call(this));
+    // Not made anew while one types or presses a button, which keeps the focus.
+    const same = shown === this.shown && this.problem === this.problemShown;
+    if (same && (shown === "empty" || this.card.matches(":active"))) return;
+    const { activeElement: focused } = document, inside = this.card.contains(focused);
+    this.card.replaceChildren(...parts[shown].call(this));
+    const again = [...this.card.querySelectorAll("button, a")].find((one) => one.textContent === focused.textContent);
+    if (inside) again?.focus();
     this.shown = shown;
     this.problemShown = this.problem;
     this.card.className = shown;
+    // On a phone the card lies above the bar.
+    this.card.style.setProperty("--bar", `${document.getElementById("bar").offsetHeight}px`);
   }
 
   // What went wrong last, for the user.
@@ -120,23 +120,20 @@ export class TrainingCard {
     return this.refusal || (this.event.state === "failed" ? this.event.message : "");
   }
 
-  // Offers to choose again, beside what is learned already.
-  another() {
-    this.choosing = true;
-    this.render();
-  }
-
   closed() {
     const { state, name, iteration = 0, total = Infinity, has_rule: learned } = this.event;
     const share = `Learning ${name}: ${Math.floor((100 * iteration) / total)} %`;
     const label = ACTIVE.includes(state) ? share : learned ? name : "Grow your own picture";
-    return [button(label, () => this.unfold(true))];
+    return [button(label, () => this.change({ open: true }))];
   }
 
-  unfold(open) {
-    this.open = open;
-    this.choosing = false;
-    this.render();
+  fold() {
+    this.change({ open: false, choosing: false });
+  }
+
+  // Renders with changed fields.
+  change(fields) {
+    this.render(Object.assign(this, fields));
   }
 
   chooser() {
@@ -145,7 +142,7 @@ export class TrainingCard {
     const typed = () => { if (emoji.value.trim()) this.take(emoji.value.trim()); };
     emoji.onkeydown = ({ key }) => { if (key === "Enter") typed(); };
     return [
-      heading("Grow your own picture", () => this.unfold(false)),
+      heading("Grow your own picture", () => this.fold()),
       text("Drop a picture or a 3D file anywhere here. Particles learn it while you watch."),
       row(button("Choose a file", () => this.file.click())),
       row(text("or an emoji"), emoji, button("Grow", typed)),
@@ -162,14 +159,14 @@ export class TrainingCard {
       learning: `Iteration ${iteration} of ${total}${left === undefined ? "" : `, ${duration(left)} left`}`,
     };
     const stop = () => {
-      this.stopping = id;
       this.send({ type: "training", action: "stop" });
-      this.render();
+      this.change({ stopping: id });
     };
     const watch = this.showing !== id && this.event.has_rule ? [button("Watch", () => this.show())] : [];
     return [
-      heading(`Learning ${name}`, () => this.unfold(false)), bar,
+      heading(`Learning ${name}`, () => this.fold()), bar,
       text(this.stopping === id ? "Stopping; what it has learned is saved…" : words[state]),
+      ...(this.event.note ? [text(this.event.note)] : []),
       row(...this.quality(), ...watch, button("Stop", stop)), ...this.problems(),
     ];
   }
@@ -183,10 +180,10 @@ export class TrainingCard {
     const how = state === "done" ? `Learned in ${duration(seconds)}` : `Stopped at iteration ${iteration} of ${total}`;
     const watches = this.showing === id;
     return [
-      heading(name, () => this.unfold(false)), text(`${how}. Cut it, wipe a part of it.`), ...this.quality(),
+      heading(name, () => this.fold()), text(`${how}. Cut it, wipe a part of it.`), ...this.quality(),
       row(link("Save rule", "rule.safetensors", ".safetensors"), link("Save page", "page.html", ".html"),
         watches ? button("Back", () => this.leave()) : button("Watch", () => this.show()),
-        button("Another", () => this.another())),
+        button("Another", () => this.change({ choosing: true }))),
       make("p", { className: "path", textContent: `The run is in ${folder}` }), ...this.problems(), this.file,
     ];
   }
