@@ -35,6 +35,7 @@ from npa_envs.training import (
 from npa_envs.training.checkpoint import check_task, has_per_world_streams, load_checkpoint
 from npa_envs.training.process_group import ProcessGroup
 from npa_envs.training.process_launcher import (
+    end_with_parent,
     joined_processes,
     launch,
     print_once,
@@ -263,6 +264,7 @@ def _of_type(cls: Any, source: Any, **changes: Any) -> Any:
 
 def main(arguments: Sequence[str]) -> int:
     """Train; return 0 if the run is finished or out of time, 130 after Ctrl-C."""
+    end_with_parent()
     if arguments and arguments[0] in {"-h", "--help"}:
         print(HELP)
         return 0

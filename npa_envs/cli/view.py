@@ -28,6 +28,7 @@ class ViewOptions(common.DeviceOptions):
     """Watch and change a live world in the browser: a rule, a training run or an environment.
 
     The page has brushes, sliders, damage and films. A run's world follows its newest checkpoint.
+    A picture, a mesh or an emoji that is dropped on the page is learned while one watches.
     The server answers only this computer; with another --host it prints a link with a token.
 
     Examples:
@@ -56,7 +57,7 @@ class ViewOptions(common.DeviceOptions):
     browser: bool = True
     """Open the page in a browser."""
     out: Path = Path("runs/view")
-    """Folder of recorded films; created where missing."""
+    """Folder of recorded films and of runs that pages start; created where missing."""
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -70,10 +71,12 @@ def main(arguments: Sequence[str]) -> int:
         # Made once before the server starts, so that errors come at once.
         make_world().close()
     from npa_envs.web.server import Site, address_of, open_port, serve
+    from npa_envs.web.training_session import Training
 
+    out = common.writable_folder(options.out)
     site = Site(
-        make_world, films=common.writable_folder(options.out), host=options.host,
-        one_at_a_time=device.type == "cuda",
+        make_world, films=out, host=options.host, one_at_a_time=device.type == "cuda",
+        training=Training(out, device=options.device),
     )  # fmt: skip
     listener = open_port(options.host, options.port)
     with contextlib.closing(listener), common.torch_threads(options.threads):

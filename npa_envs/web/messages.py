@@ -15,6 +15,9 @@ it reaches by worker_connection.js. Messages are JSON objects with a `type` and 
                               so the engine waits for a slow or hidden page
     film    action            "start" or "stop", if `capabilities` has "film"; in between the page
                               sends pictures, JPEG files as Blob objects
+    training  action          "stop" the training, "show" its world in this page, or "leave" it for
+                              the world that the page began with; what it is to learn is uploaded
+                              by HTTP, see `upload` in server.py
 
 Events are objects with a `type` and these fields:
 
@@ -25,6 +28,9 @@ Events are objects with a `type` and these fields:
                               replace those before unless `append` is true
     film    action            "stop": the film has its greatest length
     file    name, url         a file of a film is ready
+    training                  the server's training of a dropped file, at first and after changes:
+                              `TrainingEvent` has the fields; engines without one never send it
+    psnr    value             PSNR of the training's world in this page [dB], see `LearningWorld`
     error   message           a sentence for the user
 """
 
@@ -64,6 +70,26 @@ class WorldEvent(TypedDict, total=False):
     capabilities: list[str]  # Some of "film", "loss".
     playing: bool
     seed: int
+
+
+class TrainingEvent(TypedDict, total=False):
+    """The event "training"; fields that are not known yet are missing."""
+
+    type: Required[Literal["training"]]
+    state: Required[Literal["none", "reading", "starting", "learning", "done", "stopped", "failed"]]
+    limit: Required[int]  # Maximum size of an uploaded file [bytes].
+    id: str  # Name of the run's folder.
+    name: str  # Name of the file for the user, or the emoji.
+    folder: str  # Path of the run's folder.
+    note: str  # What was read, or "".
+    message: str  # Why it has failed.
+    cure: Literal["whole"]  # Upload again with this keyword, which keeps the background.
+    has_rule: bool  # Whether there is a rule to show and download.
+    iteration: int
+    total: int  # Iterations of the whole run.
+    seconds: float  # Time of the training so far [s].
+    seconds_left: float  # Estimated [s].
+    loss: float  # Training loss.
 
 
 class FrameEvent(NamedTuple):

@@ -1,13 +1,14 @@
 """The viewer's server: files of the page, a live world for each WebSocket, films.
 
 It binds the loopback address by default; at another address it requires a token. It refuses
-requests with a foreign `Host` (DNS rebinding), and sockets of pages of another origin.
+requests with a foreign `Host` (DNS rebinding), and sockets and uploads of pages of another origin.
 """
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
+import functools
 import io
 import ipaddress
 import json
@@ -29,17 +30,20 @@ from PIL import Image
 from npa_envs.atomic_files import made_folder
 from npa_envs.errors import MissingDependencyError, NPAError, shown
 from npa_envs.render import write_gif, write_mp4
+from npa_envs.web.dropped_file import MAX_BYTES
 from npa_envs.web.export import PAGE
 from npa_envs.web.live_world import LiveWorld
 from npa_envs.web.messages import FrameEvent
+from npa_envs.web.training_session import LearningWorld, Training
 
 try:
     import uvicorn
     from starlette.applications import Starlette
+    from starlette.concurrency import run_in_threadpool
     from starlette.middleware import Middleware
     from starlette.middleware.base import BaseHTTPMiddleware, RequestResponseEndpoint
     from starlette.requests import Request
-    from starlette.responses import FileResponse, PlainTextResponse, Response
+    from starlette.responses import FileResponse, JSONResponse, PlainTextResponse, Response
     from starlette.routing import Route, WebSocketRoute
     from starlette.websockets import WebSocket, WebSocketDisconnect
 except ImportError as error:
@@ -59,6 +63,9 @@ FRAMES_AHEAD = 2
 
 FRAME_SECONDS = 1.0 / 60.0
 """Minimum time between two frames [s]."""
+
+LEARNING_FRAME_SECONDS = 1.0 / 12.0
+"""The same while a training needs the processor [s]."""
 
 MESSAGES_KEPT = 256
 """Maximum number of messages in a queue; further ones are dropped."""
@@ -88,7 +95,8 @@ class Site:
 
     `make_world` makes the world of a page, in the thread that runs it. `films` is the folder for
     films. With `one_at_a_time` worlds do not run at the same time: a CUDA graph of one thread must
-    not capture another's work.
+    not capture another's work. `training` learns files that are dropped on pages; None: no page
+    offers it.
     """
 
     def __init__(
@@ -98,8 +106,10 @@ class Site:
         films: Path,
         host: str = "127.0.0.1",
         one_at_a_time: bool = False,
+        training: Training | None = None,
     ) -> None:
         self.make_world, self.films, self.host = make_world, films, host
+        self.training = training
         self.token = None if is_loopback(host) else secrets.token_urlsafe(24)
         """The required token, or None."""
         self.query = "" if self.token is None else f"?token={self.token}"
@@ -118,6 +128,16 @@ class Site:
             # With a token, any name is allowed: the token protects enough.
             return bool(name)
         return name == self.host or name in ("localhost", "127.0.0.1", "::1")
+
+    def allows_origin(self, origin: str | None, host: str) -> bool:
+        """Return whether a page of an origin may change something; None: it is no page."""
+        return origin in (None, f"http://{host}", f"https://{host}")
+
+    @property
+    def frame_seconds(self) -> float:
+        """Minimum time between two frames of a world now [s]."""
+        slow = self.training is not None and self.training.slows_worlds
+        return LEARNING_FRAME_SECONDS if slow else FRAME_SECONDS
 
     def allows_token(self, token: str | None) -> bool:
         """Return whether the token is right, or none is required."""
@@ -148,9 +168,41 @@ def make_app(site: Site) -> Starlette:
             return _refused("films need the token of the page")
         return _file_response(site.films, request, {".gif": "image/gif", ".mp4": "video/mp4"})
 
+    async def upload(request: Request) -> Response:
+        """Begin a training of the body; keywords are those of `Training.begin`."""
+        query, headers = request.query_params, request.headers
+        if site.training is None or not site.allows_token(query.get("token")):
+            return _refused("files are learned by pages of this server, with its token")
+        # Without an origin it is no page; a form of another page always has one.
+        if not site.allows_origin(headers.get("origin"), headers.get("host", "")):
+            return _refused("files are learned from the server's own page")
+        content = bytearray()
+        async for part in request.stream():
+            content += part
+            if len(content) > MAX_BYTES:
+                break
+        options = {word: word in query for word in ("emoji", "whole")}
+        name = query.get("name", "")
+        try:
+            begun = await run_in_threadpool(site.training.begin, name, bytes(content), **options)
+        except (NPAError, OSError) as error:
+            return PlainTextResponse(str(error), 409 if site.training.active else 400)
+        return JSONResponse({"id": begun})
+
+    def learned_file(request: Request) -> Response:
+        if site.training is None or not site.allows_token(request.query_params.get("token")):
+            return _refused("rules need the token of the page")
+        try:
+            path = site.training.file(request.path_params["id"], request.path_params["name"])
+        except NPAError as error:
+            return PlainTextResponse(str(error), 400)
+        if path is None:
+            return PlainTextResponse("no such file", 404)
+        return FileResponse(path, media_type="application/octet-stream", filename=path.name)
+
     async def connect(page: WebSocket) -> None:
         host, origin = page.headers.get("host", ""), page.headers.get("origin")
-        if not site.allows_host(host) or origin not in (None, f"http://{host}", f"https://{host}"):
+        if not site.allows_host(host) or not site.allows_origin(origin, host):
             return await page.close(1008, "this server answers only its own page")
         if not site.allows_token(page.query_params.get("token")):
             return await page.close(1008, "the token is missing or wrong")
@@ -176,6 +228,8 @@ def make_app(site: Site) -> Starlette:
         Route("/", page),
         WebSocketRoute("/socket", connect),
         Route("/films/{name}", film),
+        Route("/training", upload, methods=["POST"]),
+        Route("/training/{id}/{name}", learned_file),
         Route("/{name}", page_file),
     ]
     return Starlette(routes=routes, middleware=[Middleware(BaseHTTPMiddleware, dispatch=guard)])
@@ -214,8 +268,11 @@ class ViewerSession:
         self._outbox: asyncio.Queue[bytes | str] = asyncio.Queue(MESSAGES_KEPT)
         self._free_frames = threading.BoundedSemaphore(FRAMES_AHEAD)
         self._stopped = threading.Event()
+        self._next_world: Callable[[], LiveWorld] | None = None
         self._pictures: list[bytes] | None = None
         """The pictures of the film, while one is made."""
+        self._reported: Any = None
+        """The last event "training" that was sent."""
 
     async def serve(self) -> None:
         """Read and write until the page disconnects or the server stops."""
@@ -276,27 +333,32 @@ class ViewerSession:
             self._loop.call_soon_threadsafe(put)
 
     def _world_thread(self) -> None:
-        try:
-            with self._site.exclusive:
-                world = self._site.make_world()
-        except NPAError as error:
-            return self._send_error(str(error))
-        try:
-            self._run_world(world)
-        except Exception as error:
-            # A bug or a failed device: shown on the page, and raised for the log.
-            self._send_error(f"the world has ended: {shown(error)}")
-            raise
-        finally:
-            world.close()
+        make: Callable[[], LiveWorld] | None = self._site.make_world
+        while make is not None and not self._stopped.is_set():
+            try:
+                with self._site.exclusive:
+                    world = make()
+            except NPAError as error:
+                return self._send_error(str(error))
+            try:
+                make = self._run_world(world)
+            except Exception as error:
+                # A bug or a failed device: shown on the page, and raised for the log.
+                self._send_error(f"the world has ended: {shown(error)}")
+                raise
+            finally:
+                world.close()
 
-    def _run_world(self, world: LiveWorld) -> None:
+    def _run_world(self, world: LiveWorld) -> Callable[[], LiveWorld] | None:
+        """Run a world until another one is wanted; return what makes that, None at the end."""
         self._send_event(world.describe())
+        self._next_world = None
         changed = True
         clock = self._loop.time
         due = clock()
-        while not self._stopped.is_set():
+        while not self._stopped.is_set() and self._next_world is None:
             changed |= self._apply_messages(world, wait=not (world.playing or changed))
+            self._report_training()
             with self._site.exclusive:
                 events = world.take_events()
             for event in events:
@@ -308,7 +370,8 @@ class ViewerSession:
             if not self._free_frames.acquire(timeout=0.25):
                 continue
             self._stopped.wait(max(0.0, due - clock()))
-            due = max(due, clock() - FRAME_SECONDS) + FRAME_SECONDS
+            seconds = self._site.frame_seconds
+            due = max(due, clock() - seconds) + seconds
             try:
                 with self._site.exclusive:
                     if world.playing:
@@ -321,6 +384,31 @@ class ViewerSession:
                 self._send_error(f"{error}; the world is paused")
                 self._send_event(world.describe())
             changed = False
+        return self._next_world
+
+    def _report_training(self) -> None:
+        training = self._site.training
+        if training is not None and training.report is not self._reported:
+            self._reported = training.report
+            self._send_event(self._reported)
+
+    def _training_action(self, action: Any, world: LiveWorld) -> None:
+        training = self._site.training
+        if training is None:
+            raise NPAError("this server learns no files: start it by npa-envs view")
+        match action:
+            case "stop":
+                training.stop()
+            case "show" if training.report.get("has_rule"):
+                device = world.particles.x.device
+                self._next_world = functools.partial(LearningWorld, training, device=device)
+            case "leave":
+                self._next_world = self._site.make_world
+            case _:
+                raise NPAError(
+                    "a training's action must be 'stop', 'leave', or 'show' once there is a rule, "
+                    f"got {shown(action)}"
+                )
 
     def _apply_messages(self, world: LiveWorld, *, wait: bool) -> bool:
         """Apply the page's messages; return whether there were any. `wait`: for the first one."""
@@ -336,6 +424,8 @@ class ViewerSession:
                     self._add_picture(message)
                 elif message.get("type") == "film":
                     self._film_action(message.get("action"))
+                elif message.get("type") == "training":
+                    self._training_action(message.get("action"), world)
                 else:
                     with self._site.exclusive:
                         changed = world.handle(message)
@@ -462,5 +552,9 @@ def make_server(site: Site) -> uvicorn.Server:
 def serve(site: Site, listener: socket.socket) -> None:
     """Serve a site until Ctrl-C."""
     # The server shuts down first, then raises this.
-    with contextlib.suppress(KeyboardInterrupt):
-        make_server(site).run(sockets=[listener])
+    try:
+        with contextlib.suppress(KeyboardInterrupt):
+            make_server(site).run(sockets=[listener])
+    finally:
+        if site.training is not None:
+            site.training.close()

@@ -1,6 +1,7 @@
 // The engine of the viewer: the server of npa_envs/web/server.py, over a WebSocket.
 
 import { start } from "./page.js";
+import { TrainingCard } from "./training.js";
 
 const HEADER = 5; // 32-bit numbers before a frame's positions
 
@@ -12,8 +13,15 @@ async function connect(settings, listener) {
   if (token) address.searchParams.set("token", token);
   const socket = new WebSocket(address);
   socket.binaryType = "arraybuffer";
+  const send = (message) => {
+    if (socket.readyState !== WebSocket.OPEN) return;
+    socket.send(message instanceof Blob ? message : JSON.stringify(message));
+  };
+  const card = new TrainingCard(send, token);
   socket.onmessage = ({ data }) => {
-    listener(typeof data === "string" ? JSON.parse(data) : frameOf(data));
+    const event = typeof data === "string" ? JSON.parse(data) : frameOf(data);
+    card.listen(event);
+    listener(event);
   };
   await new Promise((opened, failed) => {
     socket.onopen = opened;
@@ -22,12 +30,7 @@ async function connect(settings, listener) {
   socket.onclose = ({ reason }) => listener({
     type: "error", message: reason || "the connection is closed: start npa-envs view again",
   });
-  return {
-    send(message) {
-      if (socket.readyState !== WebSocket.OPEN) return;
-      socket.send(message instanceof Blob ? message : JSON.stringify(message));
-    },
-  };
+  return { send };
 }
 
 // Frames: step, count, dimension (uint32), milliseconds, loss (float32; NaN: not computed),

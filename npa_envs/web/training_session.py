@@ -1,0 +1,315 @@
+"""The training that a page starts from a dropped file: its processes, its progress, its world."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import secrets
+import shutil
+import subprocess
+import sys
+import threading
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, cast
+
+import torch
+from torch import Tensor
+
+from npa_envs.atomic_files import made_folder, read_json, write_bytes
+from npa_envs.errors import NPAError
+from npa_envs.measure.quality import psnr
+from npa_envs.tasks.base import Task
+from npa_envs.tasks.morphogenesis2d import Morphogenesis2D
+from npa_envs.tasks.morphogenesis3d import Morphogenesis3D
+from npa_envs.training.process_launcher import PARENT_GRACE, PARENT_PIPE
+from npa_envs.training.run_folder import JsonlLog, RunFolder
+from npa_envs.training.task_table import task_entry
+from npa_envs.web.dropped_file import EMOJI, MAX_BYTES, PICTURE, READ_SECONDS, stored_name
+from npa_envs.web.export import page_rule, page_text
+from npa_envs.web.messages import TrainingEvent, WorldEvent
+from npa_envs.web.rule_world import RunWorld
+
+CHECKPOINTS = {False: 50, True: 200}
+"""Iterations between two checkpoints without and with CUDA: a few seconds."""
+
+
+class Training:
+    """What a server trains from dropped files: one run at a time, in a process of its own.
+
+    All pages of the server share it. Each run has a new folder, whose name is made of time and
+    chance. Its processes end with the server, also if that is killed (see `end_with_parent`).
+
+    Args:
+        folder: Folder in which runs get their folders.
+        device: Device to train on.
+        preset: Preset of the run; None: `best` on CUDA where the task has it, else `fast`.
+    """
+
+    def __init__(self, folder: Path, *, device: str = "cpu", preset: str | None = None) -> None:
+        self._folder, self._device, self._preset = folder, device, preset
+        self._lock = threading.Lock()
+        self._stopping = threading.Event()
+        self._thread: threading.Thread | None = None
+        self._report: TrainingEvent = {"type": "training", "state": "none", "limit": MAX_BYTES}
+
+    @property
+    def report(self) -> TrainingEvent:
+        """The event for pages; a new object after each change."""
+        return self._report
+
+    @property
+    def active(self) -> bool:
+        """Whether a file is being read or learned."""
+        return self._report["state"] in ("reading", "starting", "learning")
+
+    @property
+    def slows_worlds(self) -> bool:
+        """Whether worlds should leave the processor to the training."""
+        return self.active and self._device == "cpu"
+
+    def begin(self, name: str, content: bytes, *, emoji: bool = False, whole: bool = False) -> str:
+        """Begin to read and learn a file, and return the run's id.
+
+        The name is shown, and its suffix tells meshes from pictures. The content is the file's, or
+        with `emoji` an emoji in UTF-8. With `whole` a picture keeps its background. NPAError if
+        another training runs, or the file is empty, too large or cannot be stored.
+        """
+        shown_name = "".join(c for c in name if c.isprintable())[:80].strip() or "picture"
+        with self._lock:
+            if self.active:
+                raise NPAError(
+                    f"one file is learned at a time, and {self._report['name']} still is: stop it "
+                    "first, or wait for its end"
+                )
+            if not 0 < len(content) <= MAX_BYTES:
+                raise NPAError(
+                    f"a dropped file must have 1 byte to {MAX_BYTES >> 20} MiB, got "
+                    f"{len(content)} bytes: give another one"
+                )
+            # Random, as several servers may share the folder.
+            run = self._folder / f"{time.strftime('learned-%Y%m%d-%H%M%S')}-{secrets.token_hex(3)}"
+            stored = run / (EMOJI if emoji else stored_name(name))
+            with made_folder(run):
+                write_bytes(stored, content)
+            self._stopping.clear()
+            self._report = {
+                "type": "training", "state": "reading", "limit": MAX_BYTES, "id": run.name,
+                "name": shown_name, "folder": str(run), "note": "", "has_rule": False,
+            }  # fmt: skip
+            self._thread = threading.Thread(
+                target=self._run, args=(stored, whole), name="npa-envs training", daemon=True
+            )
+            self._thread.start()
+        return run.name
+
+    def stop(self) -> None:
+        """Let the present training save what it has learned, and end."""
+        self._stopping.set()
+
+    def close(self) -> None:
+        """Stop the present training, and wait until its processes have ended."""
+        self.stop()
+        if self._thread is not None:
+            self._thread.join(2.0 * PARENT_GRACE)
+
+    def file(self, run_id: str, name: str) -> Path | None:
+        """Return a file of the latest run to download: its rule, or its page, which is made now.
+
+        None: there is no such run, or it has no rule yet. Raises NPAError if the rule cannot run
+        in a page.
+        """
+        report = self._report
+        if run_id != report.get("id") or not report.get("has_rule"):
+            return None
+        rule = RunFolder(Path(report["folder"])).rule
+        if name == rule.name:
+            return rule
+        if name != "page.html":
+            return None
+        shown_rule = page_rule(str(rule))
+        title = report["name"]
+        shown_rule |= {"name": title, "world": shown_rule["world"] | {"title": title, "note": ""}}
+        path = rule.with_name(name)
+        write_bytes(path, page_text([shown_rule], title=title).encode())
+        return path
+
+    def _set(self, **fields: Any) -> None:
+        report: Any = self._report | fields
+        if report != self._report:
+            self._report = report
+
+    def _run(self, stored: Path, whole: bool) -> None:
+        try:
+            self._read_and_learn(stored, whole)
+        except Exception as error:
+            message = str(error).replace(str(stored), self._report["name"])
+            if "keep_background" in message and not whole:
+                self._set(cure="whole")
+            self._set(state="failed", message=message)
+        if not self._report["has_rule"]:
+            shutil.rmtree(stored.parent, ignore_errors=True)
+
+    def _read_and_learn(self, stored: Path, whole: bool) -> None:
+        folder = stored.parent
+        words = ["npa_envs.web.dropped_file", str(stored), *(["whole"] if whole else [])]
+        output = self._call(words, folder, "reading the file", seconds=READ_SECONDS)
+        if self._stopping.is_set():
+            return self._set(state="stopped")
+        self._set(state="starting", note=output.replace(str(stored), self._report["name"]).strip())
+        flat = (folder / PICTURE).exists()
+        task = "morphogenesis2d" if flat else "morphogenesis3d"
+        target = folder / PICTURE if flat else stored
+        text = stored.read_text("utf-8") if stored.name == EMOJI else target
+        cuda = self._device != "cpu"
+        best = cuda and "best" in task_entry(task).presets
+        self._call(
+            [
+                "npa_envs", "train", task, f"--target={text}", f"--out={folder}",
+                f"--preset={self._preset or ('best' if best else 'fast')}",
+                f"--device={self._device}", f"--checkpoint-interval={CHECKPOINTS[cuda]}",
+                "--picture-interval=0", "--no-tensorboard", "--no-progress", "--no-report",
+                *(["--keep-background"] if whole and flat else []),
+            ],
+            folder,
+            "the training",
+        )  # fmt: skip
+        self._look(folder)
+        self._set(state="stopped" if self._stopping.is_set() else "done", seconds_left=0.0)
+
+    def _call(
+        self, words: list[str], folder: Path, what: str, *, seconds: float | None = None
+    ) -> str:
+        """Run a module of the package until its end, or until it is stopped; return its output.
+
+        Raises NPAError, which calls it `what`, if it fails or takes longer than `seconds`.
+        """
+        path = folder / "output.txt"
+        with path.open("wb") as file:
+            process = subprocess.Popen(
+                [sys.executable, "-m", *words],
+                stdin=subprocess.PIPE, stdout=file, stderr=subprocess.STDOUT,
+                env=os.environ | {PARENT_PIPE: "1", "PYTHONIOENCODING": "utf-8"},
+                # Ctrl-C is for the server, which then stops the training.
+                start_new_session=True,
+            )  # fmt: skip
+        begun = time.monotonic()
+        try:
+            while process.poll() is None and not self._stopping.wait(0.25):
+                if seconds is not None and time.monotonic() > begun + seconds:
+                    raise NPAError(f"{what} must take at most {seconds} s: give a smaller file")
+                self._look(folder)
+        finally:
+            end_process(process)
+        output = path.read_text("utf-8", errors="replace")
+        if process.returncode and not self._stopping.is_set():
+            _, found, error = output.rpartition("npa-envs: error: ")
+            raise NPAError(
+                error.strip()
+                if found
+                else f"{what} ended with code {process.returncode} (-9 is "
+                f"often a lack of memory): see {path}, or try a smaller file"
+            )
+        return output
+
+    def _look(self, folder: Path) -> None:
+        """Read the run's progress from its files."""
+        run = RunFolder(folder)
+        if not run.rule.exists():
+            return
+        if not self._report["has_rule"]:
+            config = read_json(run.config)
+            total = config["iterations"] * config["repeats"]
+            self._set(state="learning", has_rule=True, iteration=0, total=total)
+        with contextlib.suppress(NPAError):  # A line that is being written.
+            # The last ones say how long the rest takes.
+            records = JsonlLog(run.log).records()[-20:]
+            if records:
+                first, last = records[0], records[-1]
+                self._set(**{name: last[name] for name in ("iteration", "loss", "seconds")})
+            if len(records) > 1:
+                done, seconds = (last[name] - first[name] for name in ("iteration", "seconds"))
+                left = self._report["total"] - last["iteration"]
+                self._set(seconds_left=round(seconds / done * left, 1))
+
+
+def end_process(process: subprocess.Popen[bytes]) -> None:
+    """End a process that watches its parent: it may save; after some time it is killed."""
+    assert process.stdin is not None, "it was opened as a pipe"
+    process.stdin.close()
+    try:
+        process.wait(PARENT_GRACE + 2.0)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.wait()
+
+
+# The world of a training.
+
+WHITE_SIDE = 256
+"""Side of the pictures that are compared [pixels]."""
+
+GROWN = 96
+"""Age from which a world is compared with its picture [steps]."""
+
+OLD = 320
+"""Age from which a world begins again when its rule is replaced [steps]: early rules lead worlds
+to where later ones never are."""
+
+
+class LearningWorld(RunWorld):
+    """The world of the latest run of a training, which begins again with later rules."""
+
+    def __init__(self, training: Training, *, device: torch.device) -> None:
+        self._training = training
+        self._title, self._run_id = training.report["name"], training.report["id"]
+        self._psnr: float | None = None
+        self._end_awaited = True
+        super().__init__(Path(training.report["folder"]), device=device)
+        self.speed = 2
+
+    @property
+    def learns(self) -> bool:
+        """Whether its rule is still being trained."""
+        return self._training.active and self._training.report["id"] == self._run_id
+
+    def describe(self) -> WorldEvent:
+        """Return the event "world" for the page, with the dropped file's name as title."""
+        return super().describe() | {"title": self._title, "note": ""}
+
+    def _take_rules(self) -> None:
+        super()._take_rules()
+        if self.step >= OLD or not self.learns:
+            self.reset(self.seed)
+
+    def _poll(self) -> None:
+        super()._poll()
+        if self._end_awaited and not self.learns:
+            self._end_awaited = False
+            self.reset(self.seed)
+        if self.step < GROWN or not self._is_unchanged():
+            return
+        value = round(float(psnr_on_white(self.task, *self.particles[:2])), 1)
+        if value != self._psnr:
+            self._psnr = value
+            self._events.append({"type": "psnr", "value": value})
+
+
+@torch.no_grad()
+def psnr_on_white(task: Task, x: Tensor, s: Tensor) -> Tensor:
+    """Return the mean PSNR [dB], [], of worlds to their target, both drawn on white.
+
+    In 2D the world's mean is moved to the target's, and pictures have 256 pixels on each side; in
+    3D it is that of the task's held-out views.
+    """
+    if task.has_views:
+        return cast(Morphogenesis3D, task).view_psnr(x, s).mean()
+    flat = cast(Morphogenesis2D, task)
+    config = replace(flat.config, resolution=WHITE_SIDE)
+    fine = Morphogenesis2D(config, target=flat.target, device=x.device)
+    pictures = torch.cat((fine.picture(x, s), fine.target_picture[None]))
+    # Where spots overlap, densities exceed 1, and colours are means.
+    rgb = pictures[..., :3] / pictures[..., 3:].clamp_min(1.0)
+    rgb = rgb + 1.0 - pictures[..., 3:].clamp(0.0, 1.0)
+    return psnr(rgb[:-1], rgb[-1:]).mean()

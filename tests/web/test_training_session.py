@@ -1,0 +1,395 @@
+"""What a page drops is read within limits and learned in processes that end with the server."""
+
+from __future__ import annotations
+
+import base64
+import io
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+import urllib.request
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from support.browser import DESK
+
+from npa_envs import NPAError, load_rule, save_rule
+from npa_envs.training import preset
+from npa_envs.training.task_table import TASKS
+from npa_envs.web import dropped_file, training_session
+from npa_envs.web.dropped_file import read_dropped, stored_name
+from npa_envs.web.training_session import OLD, LearningWorld, Training, psnr_on_white
+
+pytest.importorskip("uvicorn")
+testclient = pytest.importorskip("starlette.testclient")
+
+from npa_envs.web import server  # noqa: E402
+from npa_envs.web.rule_world import RuleWorld  # noqa: E402
+
+HERE = "http://127.0.0.1:8765"
+BAD_NAMES = [
+    "../../evil.png", "/etc/passwd", "..\\..\\evil.png", "a\0b.png", "x" * 5000, "", "..", "\n.png",
+    "C:\\evil.glb", "picture.png\0.glb", "dropped/../../../mesh.obj", "<img src=x onerror=a(1)>",
+]  # fmt: skip
+CPU = torch.device("cpu")
+
+
+def png(*, opaque=False, size=(48, 48), noise=False) -> bytes:
+    """A red disk on nothing, or on white; or noise without a plain background."""
+    rows, columns = np.mgrid[: size[1], : size[0]]
+    inside = np.hypot(rows - size[1] / 2, columns - size[0] / 2) < 0.4 * min(size)
+    pixels = np.full((*inside.shape, 4), 255, np.uint8)
+    pixels[inside, 1:3] = 40
+    pixels[~inside, 3] = 255 if opaque or noise else 0
+    if noise:
+        pixels[..., :3] = np.random.default_rng(0).integers(0, 255, (*inside.shape, 3))
+    file = io.BytesIO()
+    Image.fromarray(pixels).save(file, "PNG")
+    return file.getvalue()
+
+
+@pytest.fixture
+def held(tmp_path, monkeypatch):
+    """A training whose files are stored, and neither read nor learned until it is stopped."""
+
+    def wait(self, *_):
+        self._stopping.wait(60)
+        self._set(state="stopped", has_rule=True)
+
+    monkeypatch.setattr(Training, "_read_and_learn", wait)
+    training = Training(tmp_path / "runs")
+    yield training
+    training.close()
+
+
+def client_of(training, host="127.0.0.1"):
+    site = server.Site(lambda: None, films=training._folder, host=host, training=training)
+    return site, testclient.TestClient(server.make_app(site), base_url=HERE)
+
+
+def wait_until(condition, seconds=300.0):
+    end = time.monotonic() + seconds
+    while not (value := condition()):
+        assert time.monotonic() < end, "never true"
+        time.sleep(0.05)
+    return value
+
+
+def processes_of(folder: Path) -> list[str]:
+    """The processes that have a folder in their arguments."""
+    lines = subprocess.check_output(["ps", "-ewwo", "pid=,stat=,args="], text=True).splitlines()
+    return [line for line in lines if str(folder) in line and line.split()[1][0] != "Z"]
+
+
+@pytest.mark.parametrize("name", BAD_NAMES)
+def test_a_name_never_becomes_a_path(held, name, tmp_path):
+    _, client = client_of(held)
+    before = set(tmp_path.parent.iterdir())
+    answer = client.post("/training", params={"name": name}, content=b"content")
+    assert answer.status_code == 200
+    (file,) = (path for path in tmp_path.rglob("*") if path.is_file())
+    assert file.relative_to(tmp_path).parts == ("runs", answer.json()["id"], stored_name(name))
+    assert file.name in ("dropped", "dropped.glb", "dropped.obj")
+    assert set(tmp_path.parent.iterdir()) == before
+    assert 0 < len(held.report["name"]) <= 80
+    assert held.report["name"].isprintable()
+
+
+def test_one_file_is_learned_at_a_time_and_the_page_hears_why(held):
+    _, client = client_of(held)
+    assert client.post("/training", params={"name": "cat.png"}, content=b"1").status_code == 200
+    second = client.post("/training", params={"name": "dog.png"}, content=b"2")
+    assert second.status_code == 409
+    assert "cat.png still is: stop it first" in second.text
+    held.close()
+    third = client.post("/training", params={"name": "dog.png"}, content=b"2")
+    assert third.status_code == 200
+    assert held.report["name"] == "dog.png"
+
+
+@pytest.mark.parametrize("size", [0, 1001, 5000])
+def test_a_file_that_is_empty_or_huge_is_refused(held, size, monkeypatch):
+    for module in (server, training_session):
+        monkeypatch.setattr(module, "MAX_BYTES", 1000)
+    _, client = client_of(held)
+    answer = client.post("/training", params={"name": "a.png"}, content=b"x" * size)
+    assert answer.status_code == 400
+    assert "a dropped file must have 1 byte to" in answer.text
+    assert not held._folder.exists()
+
+
+def test_only_the_servers_own_page_with_its_token_may_upload_and_download(held):
+    _, client = client_of(held)
+    for origin in ("http://evil.example", "null", "http://127.0.0.1:9999"):
+        foreign = client.post("/training", content=b"1", headers={"origin": origin})
+        assert foreign.status_code == 403
+    assert client.post("/training", content=b"1", headers={"host": "evil"}).status_code == 403
+    site, shared = client_of(held, host="0.0.0.0")
+    assert shared.post("/training", content=b"1").status_code == 403
+    assert shared.post("/training?token=wrong", content=b"1").status_code == 403
+    assert shared.get("/training/x/rule.safetensors").status_code == 403
+    assert not held.active
+    mine = shared.post("/training", params={"token": site.token}, content=b"1")
+    assert mine.status_code == 200
+    # Nothing is offered before there is a rule, and nothing but rule and page after.
+    (held._folder / mine.json()["id"] / "rule.safetensors").write_bytes(b"rule")
+    for path in ("rule.safetensors", "dropped", "..%2f..%2fsecret", "output.txt"):
+        address = f"/training/{mine.json()['id']}/{path}?token={site.token}"
+        assert shared.get(address).status_code == 404
+        held._set(has_rule=True)
+        assert shared.get(address).status_code == (200 if path.startswith("rule") else 404)
+        held._set(has_rule=False)
+    assert client_of(Training(held._folder))[1].get("/training/x/page.html").status_code == 404
+
+
+def test_a_server_without_training_takes_no_files(tmp_path):
+    site = server.Site(lambda: None, films=tmp_path)
+    client = testclient.TestClient(server.make_app(site), base_url=HERE)
+    assert client.post("/training", content=b"1").status_code == 403
+    assert client.get("/training/x/rule.safetensors").status_code == 403
+
+
+def test_what_is_to_grow_is_written_as_a_picture_of_limited_size(tmp_path):
+    (tmp_path / "dropped").write_bytes(png(size=(1600, 800)))
+    read_dropped(tmp_path / "dropped")
+    with Image.open(tmp_path / "picture.png") as picture:
+        assert picture.size == (1024, 512)
+        assert picture.getpixel((512, 256)) == (255, 40, 40, 255)
+        assert picture.getpixel((2, 2))[3] == 0
+
+
+def test_an_opaque_photograph_is_refused_with_its_cure(tmp_path):
+    path = tmp_path / "dropped"
+    path.write_bytes(png(noise=True))
+    with pytest.raises(NPAError, match="keep_background"):
+        read_dropped(path)
+    read_dropped(path, whole=True)
+    with Image.open(tmp_path / "picture.png") as picture:
+        assert picture.getextrema()[3] == (255, 255)
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "error"),
+    [
+        ("dropped", b"no picture", "must be a picture"),
+        ("dropped", png()[:-60], "truncated or damaged"),
+        ("dropped", png(size=(8, 8)).replace(b"IHDR", b"IHDX"), "must be a picture|truncated"),
+        ("emoji.txt", b"gecko", "one picture symbol, got 'gecko'"),
+        ("emoji.txt", b"\xff\xfe", "picture symbol|colour-emoji font|an installed font"),
+        ("emoji.txt", "/\U0001f98a".encode(), "one picture symbol"),
+        ("emoji.txt", b"", "one picture symbol"),
+    ],
+)  # fmt: skip
+def test_what_cannot_be_learned_is_refused(tmp_path, name, content, error):
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(NPAError, match=error):
+        read_dropped(tmp_path / name)
+
+
+def test_a_mesh_of_too_many_triangles_is_refused(tmp_path, monkeypatch):
+    pytest.importorskip("trimesh")
+    path = tmp_path / "dropped.obj"
+    path.write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 2 3\nf 1 2 4\n", encoding="utf-8")
+    read_dropped(path)
+    monkeypatch.setattr(dropped_file, "MAX_TRIANGLES", 1)
+    with pytest.raises(NPAError, match="at most 1 triangles, got 2"):
+        read_dropped(path)
+
+
+def test_the_psnr_of_the_target_itself_is_the_largest_and_a_blank_worlds_is_low():
+    task = TASKS["morphogenesis2d"].make(preset("tiny", target="heart").task, CPU)
+    points, colours = task.target.points[None], task.target.colours[None]
+    s = torch.cat((torch.zeros(1, points.shape[1], 13), colours - 0.5), dim=-1)
+    assert psnr_on_white(task, points, s) > 60
+    assert psnr_on_white(task, points, torch.zeros_like(s)) < 20
+    assert psnr_on_white(task, points * 3.0, s) < 12
+
+
+def test_an_old_world_begins_again_with_a_later_rule_and_once_more_at_the_end(tmp_path):
+    config = preset("tiny", target="heart")
+    metadata = {"task": "morphogenesis2d", "config": json.dumps(_stored(config))}
+    task = TASKS["morphogenesis2d"].make(config.task, CPU)
+    rule = task.make_rule(torch.Generator().manual_seed(0))
+    save_rule(rule, tmp_path / "rule.safetensors", metadata=metadata)
+    training = Training(tmp_path)
+    training._set(state="learning", id="x", name="heart.png", folder=str(tmp_path), has_rule=True)
+    world = LearningWorld(training, device=CPU)
+    assert world.describe()["title"] == "heart.png"
+    for step, after in ((OLD, 0), (OLD - 1, OLD - 1)):
+        world.step = step
+        with torch.no_grad():
+            rule.hidden.bias += 0.01
+        save_rule(rule, tmp_path / "rule.safetensors", metadata=metadata)
+        world._poll()
+        assert world.step == after
+        assert torch.equal(world.main.rule.hidden.bias, rule.hidden.bias)
+    training._set(state="done")
+    world._poll()
+    assert world.step == 0
+    world.step = 5
+    world._poll()
+    assert world.step == 5
+
+
+def _stored(config):
+    from npa_envs.training import config_to_dict
+
+    return {k: v for k, v in config_to_dict(config).items() if k not in ("out", "device")}
+
+
+# With processes.
+
+
+def test_the_page_hears_in_words_what_the_child_refuses(tmp_path):
+    training = Training(tmp_path)
+    training.begin("holiday.jpg", png(noise=True))
+    wait_until(lambda: not training.active)
+    report = training.report
+    assert (report["state"], report["cure"]) == ("failed", "whole")
+    assert "holiday.jpg" in report["message"]
+    assert str(tmp_path) not in report["message"]
+    # Nothing is left of it.
+    wait_until(lambda: list(tmp_path.iterdir()) == [])
+
+
+@pytest.mark.slow
+def test_a_file_whose_reading_takes_too_long_or_too_much_memory_is_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr(training_session, "READ_SECONDS", 0.1)
+    training = Training(tmp_path)
+    training.begin("a.png", png())
+    wait_until(lambda: not training.active)
+    assert "must take at most 0.1 s" in training.report["message"]
+    wait_until(lambda: processes_of(tmp_path) == [])
+    if sys.platform == "linux":
+        code = (
+            "from npa_envs.web.dropped_file import limit_resources; limit_resources()\n"
+            "try: bytearray(2**32)\nexcept MemoryError: print('limited')"
+        )
+        assert subprocess.check_output([sys.executable, "-c", code], text=True) == "limited\n"
+
+
+@pytest.mark.slow
+def test_a_dropped_picture_is_learned_and_offered(tmp_path):
+    training = Training(tmp_path, preset="tiny")
+    run_id = training.begin("red <disk>.png", png())
+    wait_until(lambda: not training.active)
+    report = training.report
+    assert (report["state"], report["iteration"], report["total"]) == ("done", 40, 40)
+    assert report["loss"] > 0
+    rule = load_rule(training.file(run_id, "rule.safetensors"))
+    assert rule.hidden_dim == 32
+    page = training.file(run_id, "page.html").read_text(encoding="utf-8")
+    assert "<title>red &lt;disk&gt;.png</title>" in page
+    assert "<disk>" not in page
+    with pytest.raises(NPAError):
+        training.begin("a.png", b"")
+    # Another one can be learned afterwards; the first keeps its folder.
+    other = training.begin("b.png", png(opaque=True))
+    assert training.file(run_id, "rule.safetensors") is None
+    training.close()
+    assert training.report["state"] == "stopped"
+    assert (tmp_path / run_id / "rule.safetensors").exists()
+    assert other != run_id
+
+
+@pytest.mark.slow
+def test_a_stopped_training_keeps_its_rule_and_no_process(tmp_path):
+    training = Training(tmp_path)
+    training.begin("a.png", png())
+    wait_until(lambda: training.report.get("iteration", 0) >= 10)
+    assert processes_of(tmp_path)
+    training.stop()
+    wait_until(lambda: not training.active, 60)
+    assert training.report["state"] == "stopped"
+    wait_until(lambda: processes_of(tmp_path) == [], 60)
+    assert load_rule(training.file(training.report["id"], "rule.safetensors")).state_dim == 16
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("moment", ["reading", "learning"])
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM, signal.SIGINT])
+def test_no_process_outlives_the_server(tmp_path, moment, number):
+    command = [sys.executable, "-m", "npa_envs", "view", "heart", "--particle-count", "64"]
+    command += ["--no-browser", "--port", "0", "--out", str(tmp_path)]
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, text=True, encoding="utf-8", start_new_session=True
+    ) as run:
+        address = run.stdout.readline().split()[1]
+        request = urllib.request.Request(f"{address}training?name=a.png", data=png(), method="POST")
+        with urllib.request.urlopen(request, timeout=60) as answer:
+            folder = tmp_path / json.load(answer)["id"]
+        if moment == "learning":
+            log = folder / "log.jsonl"
+            wait_until(lambda: log.exists() and log.stat().st_size > 0)
+        wait_until(lambda: processes_of(folder))
+        os.kill(run.pid, number)
+        run.wait(timeout=60)
+        wait_until(lambda: processes_of(folder) == [], 60)
+
+
+# In a browser.
+
+
+@pytest.mark.slow
+def test_a_drop_is_watched_in_its_tab_and_offered_in_another(new_page, tmp_path):
+    def make_world():
+        torch.set_num_threads(1)
+        return RuleWorld("heart", device=CPU, particle_count=64)
+
+    training = Training(tmp_path / "runs", preset="tiny")
+    site = server.Site(make_world, films=tmp_path, training=training)
+    listener = server.open_port(site.host, 0)
+    viewer = server.make_server(site)
+    thread = threading.Thread(target=viewer.run, kwargs={"sockets": [listener]})
+    thread.start()
+    first, second = new_page(), new_page()
+
+    def drop(page, content, name):
+        data = base64.b64encode(content).decode()
+        page.run(
+            f"(() => {{ const bytes = Uint8Array.from(atob('{data}'), (c) => c.charCodeAt()); "
+            f"const moved = new DataTransfer(); moved.items.add(new File([bytes], '{name}')); "
+            "dispatchEvent(new DragEvent('drop', { dataTransfer: moved })); })()"
+        )
+
+    says = "document.getElementById('training').innerText"
+    try:
+        for page in (first, second):
+            page.open(server.address_of(site, listener), DESK)
+            page.wait("document.page.frame.step > 1")
+            page.wait(f"{says}.includes('Grow your own picture')")
+        drop(first, png(noise=True), "photo.jpg")
+        first.wait(f"{says}.includes('Grow the whole picture')")
+        assert "photo.jpg" in first.run(says)
+        drop(first, png(), "disk.png")
+        second.wait(f"{says}.includes('Learning disk.png')")
+        drop(second, png(), "late.png")
+        second.wait(f"{says}.includes('disk.png still is')")
+        first.wait("document.page.world.title === 'disk.png'")
+        first.wait(f"{says}.includes('Learned in')")
+        assert second.run("document.page.world.title") == "heart"
+        second.run("[...document.querySelectorAll('#training button')]"
+                   ".find((one) => one.textContent === 'Watch').click()")  # fmt: skip
+        second.wait("document.page.world.title === 'disk.png'")
+        links = second.run("[...document.querySelectorAll('#training a')].map((a) => a.href)")
+        for link, part in zip(links, (b"iteration", b"<title>disk.png</title>"), strict=True):
+            with urllib.request.urlopen(link, timeout=120) as answer:
+                assert part in answer.read()
+        # A page that is loaded again goes on with what it has begun.
+        first.run("location.reload()")
+        first.wait("document.page.world.title === 'disk.png'")
+        assert not first.complaints
+        assert all("409" in complaint for complaint in second.complaints)
+    finally:
+        for page in (first, second):
+            page.open("about:blank")
+        viewer.should_exit = True
+        thread.join(60)
+        training.close()
