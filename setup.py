@@ -25,7 +25,7 @@ def with_links(text, address):
         mark, label, path = found.groups()
         if address:
             kind = "raw" if mark else "blob"
-            return f"{mark}[{label}]({address.rstrip('/')}/{kind}/main/{path})"
+            return f"{mark}[{label}]({re.sub(r'([.]git)?/?$', '', address)}/{kind}/main/{path})"
         return "" if mark else label
 
     return re.sub(relative, link, text)

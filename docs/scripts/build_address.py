@@ -74,7 +74,7 @@ PLACES = (
     ),
     Place(
         "CONTRIBUTING.md",
-        "announce the entries in Farama's Discord, then add them by a pull request to each list.\n",
+        "announce them in Farama's Discord, then add them to each list by a pull request.\n",
         """
 ```markdown
 - [npa-envs: Neural Particle Automata](<address>)
