@@ -23,6 +23,10 @@ from sphinx.util.docutils import SphinxDirective
 
 import npa_envs
 
+sys.path.append(str(Path(__file__).parent / "scripts"))
+
+from build_address import names_of, repository_address
+
 ROOT = Path(__file__).resolve().parents[1]
 
 project = "npa-envs"
@@ -69,10 +73,17 @@ html_static_path = ["static"]
 html_css_files = ["site.css"]
 html_extra_path = ["static/index.html"]
 html_show_sphinx = False
+if (address := repository_address()) is not None:
+    html_baseurl = names_of(address)["site"]
+    html_theme_options = {
+        "source_repository": address,
+        "source_branch": "main",
+        "source_directory": "",
+    }
 html_copy_source = False
 
-LISTS = ("docs/index", "docs/environments/README", "docs/api/README", "docs/gallery")
-"""Pages whose lists of links are the site's menu."""
+LISTS = ("docs/pages", "docs/environments/README", "docs/api/README", "docs/gallery")
+"""Pages whose lists of links are the site's menu; its parts are those of the first one."""
 
 LINK = re.compile(r"^(?:- |\| |### )\[[^\]]+\]\(([\w./-]+)\.(?:md|ipynb)\)", re.MULTILINE)
 
@@ -81,9 +92,13 @@ def add_menus(_: Sphinx, name: str, source: list[str]) -> None:
     """Add what a page lists to the menu: one part of it for each of the page's sections."""
     if name.startswith("benchmarks/"):
         source[0] = f"---\norphan: true\n---\n{source[0]}"
-    if name not in LISTS:
+    text = source[0]
+    if name == root_doc:
+        text = (ROOT / f"{LISTS[0]}.md").read_text(encoding="utf-8")
+        source[0] += "\n```{toctree}\n:hidden:\n\npages\n```\n"
+    elif name not in LISTS[1:]:
         return
-    parts = re.split(r"^## (.+)$", source[0], flags=re.MULTILINE)
+    parts = re.split(r"^## (.+)$", text, flags=re.MULTILINE)
     for heading, text in zip(["", *parts[1::2]], parts[::2], strict=True):
         names = LINK.findall(text)
         if names:

@@ -9,7 +9,9 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
+import build_address
 import nbformat
 from nbclient import NotebookClient
 
@@ -18,8 +20,12 @@ FOLDER = Path(__file__).resolve().parents[1] / "notebooks"
 
 def run(path: Path) -> None:
     """Run a notebook and write its outputs into it."""
-    notebook = nbformat.read(path, as_version=4)
-    NotebookClient(notebook, timeout=1200, resources={"metadata": {"path": path.parent}}).execute()
+    own = build_address.with_colab(path.read_text(encoding="utf-8"), path.stem, None)
+    notebook = nbformat.reads(own, as_version=4)
+    with TemporaryDirectory() as folder:
+        # What a notebook writes is not kept.
+        resources = {"metadata": {"path": folder}}
+        NotebookClient(notebook, timeout=1200, resources=resources).execute()
     for number, cell in enumerate(notebook.cells, start=1):
         cell.id = f"cell-{number}"
         cell.metadata.pop("execution", None)
@@ -38,3 +44,4 @@ def run(path: Path) -> None:
 if __name__ == "__main__":
     for name in sys.argv[1:] or sorted(path.stem for path in FOLDER.glob("*.ipynb")):
         run(FOLDER / f"{name}.ipynb")
+    build_address.main([])

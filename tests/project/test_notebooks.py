@@ -11,9 +11,10 @@ import torch
 FOLDER = Path(__file__).resolve().parents[2] / "docs/notebooks"
 SMALL = {
     "grow_and_hurt": {"particle_count": 256, "growth": 16, "healing": 16},
-    "own_loss": {"iterations": 2, "world_count": 2, "particle_count": 64, "watched": 6},
+    "own_loss": {"iterations": 2, "world_count": 2, "particle_count": 64},
     "hidden_channels": {"particle_count": 128, "growth": 16},
-    "species_and_ppo": {"particle_count": 256, "meeting": 2, "rounds": 1, "world_count": 4},
+    "ppo_for_species": {"rounds": 1, "world_count": 4},
+    "two_species": {"particle_count": 256, "meeting": 2},
 }
 """What the cell with the tag "parameters" assigns, small."""
 
@@ -22,9 +23,10 @@ LARGEST = 300_000
 
 
 def cells(name: str, kind: str) -> list[dict]:
-    """The cells of a notebook that are of a kind."""
+    """The cells of a notebook that are of a kind, without those for Colab."""
     notebook = json.loads((FOLDER / f"{name}.ipynb").read_text(encoding="utf-8"))
-    return [cell for cell in notebook["cells"] if cell["cell_type"] == kind]
+    own = [c for c in notebook["cells"] if "address" not in c["metadata"].get("tags", ())]
+    return [cell for cell in own if cell["cell_type"] == kind]
 
 
 def run_cell(source: str, names: dict) -> object:
@@ -42,9 +44,10 @@ def test_every_notebook_is_tested():
 
 
 @pytest.mark.parametrize("name", SMALL)
-def test_a_notebook_runs(name, capsys):
+def test_a_notebook_runs(name, capsys, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
     plt.switch_backend("Agg")
-    state = torch.random.get_rng_state()
+    state, threads = torch.random.get_rng_state(), torch.get_num_threads()
     names = {"__name__": "__main__"}
     results = []
     for cell in cells(name, "code"):
@@ -53,6 +56,7 @@ def test_a_notebook_runs(name, capsys):
             assert set(SMALL[name]) <= set(names)
             names |= SMALL[name]
     torch.random.set_rng_state(state)
+    torch.set_num_threads(threads)
     plt.close("all")
     # Where a notebook prints a number, it is one.
     assert "nan" not in capsys.readouterr().out
@@ -71,3 +75,25 @@ def test_a_notebook_is_stored_as_it_ran(name):
     assert stored
     assert not [out for out in stored if out["output_type"] == "error"]
     assert not [out for out in stored if out.get("name") == "stderr"]
+
+
+@pytest.mark.parametrize("name", SMALL)
+def test_a_notebook_has_an_exercise_with_a_solution_that_is_folded(name):
+    notebook = json.loads((FOLDER / f"{name}.ipynb").read_text(encoding="utf-8"))["cells"]
+    starts = [k for k, cell in enumerate(notebook) if cell["source"][0] == "## Exercise\n"]
+    assert len(starts) == 1
+    solution = notebook[starts[0] + 1]
+    assert solution["cell_type"] == "code"
+    assert solution["outputs"]
+    assert "hide-cell" in solution["metadata"]["tags"]
+
+
+def test_the_page_about_an_own_loss_has_the_program_of_its_notebook():
+    page = (FOLDER.parent / "own_loss.md").read_text(encoding="utf-8")
+    program = page.split("```python\n")[1].split("```")[0].split("\n")
+    sources = ["".join(cell["source"]) for cell in cells("own_loss", "code")]
+    trained = next(k for k, source in enumerate(sources) if "save_rule" in source)
+    lines = "\n".join(sources[: trained + 1]).split("\n")
+    assert list(filter(None, program)) == list(filter(None, lines))
+    (printed,) = (out["text"] for out in cells("own_loss", "code")[trained]["outputs"])
+    assert f"```text\n{''.join(printed)}```" in page
