@@ -106,11 +106,8 @@ def suggest(name: object, known: Iterable[str]) -> str:
     names = sorted(known)
     nearest = max(names, key=lambda one: _likeness(name, one), default="")
     hint = f"did you mean {shown(nearest)}? " if _likeness(name, nearest) >= 0.65 else ""
-    if len(names) > KNOWN_LENGTH:
-        return (
-            f"{hint}known: {', '.join(names[:KNOWN_LENGTH])} and {len(names) - KNOWN_LENGTH} more"
-        )
-    return f"{hint}known: {', '.join(names)}"
+    more = f" and {len(names) - KNOWN_LENGTH} more" if len(names) > KNOWN_LENGTH else ""
+    return f"{hint}known: {', '.join(names[:KNOWN_LENGTH])}{more}"
 
 
 def _likeness(name: object, known: str) -> float:

@@ -70,9 +70,8 @@ def main(arguments: Sequence[str]) -> int:
     )
 
     if arguments and "-v" in arguments[0]:
-        raise NPAError(
-            f"learn needs a method first: npa-envs learn ppo {shown(arguments[0])[1:-1]}"
-        )
+        env = shown(arguments[0])[1:-1]
+        raise NPAError(f"learn needs a method first, got {env!r}: npa-envs learn ppo {env}")
     with joined_processes() as processes:
         request = None
         if processes.first:

@@ -506,12 +506,19 @@ def test_a_message_becomes_one_line_and_an_interruption_has_no_traceback(monkeyp
 
 
 def test_demo_shows_growth_healing_and_training(tmp_path, monkeypatch, capsys):
-    for name in ("GROW_STEPS", "HEAL_STEPS"):
-        monkeypatch.setattr(demo, name, 8)
+    # A world that has hardly begun to grow: a frame for the seed, each step and each wound.
+    monkeypatch.setattr(demo, "GROWING", ((4, 1),))
+    monkeypatch.setattr(demo, "HEALING", ((4, 2),))
     words = ["demo", "--out", str(tmp_path), "--train-seconds", "1", "--no-progress"]
     assert main(words) == 0
     text = capsys.readouterr().out
-    assert len(re.findall(r"PSNR +\d+\.\d+ dB", text)) == 4
+    assert len(re.findall(r"PSNR +\d+\.\d+ dB", text)) == 2
+    times = r"rises to \d+\.\d times that before, then falls to \d+\.\d times"
+    for wound in ("cut through the spots", "wipe of an eye"):
+        assert re.search(rf"a {wound} (heals|heals but for a scar|does not heal) in 4 .*{times}", text)
+    with Image.open(tmp_path / "gecko.gif") as film:
+        assert film.size == (512, 512)
+        assert film.n_frames == 5 + 2 * (1 + 2)
     assert (tmp_path / "report.txt").read_text(encoding="utf-8") in text
     written = {Path(name) for name in re.findall(r"wrote (\S+)", text)}
     assert {path.suffix for path in written} == {".gif", ".mp4", ".png", ".txt", ".safetensors"}
