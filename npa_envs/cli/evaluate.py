@@ -41,8 +41,8 @@ class EvaluateOptions(common.RuleOptions):
     seed_count: int = 8
     """Worlds to measure, each from a different seed; for point clouds all test clouds."""
     healing: bool = False
-    """Also damage the grown worlds by a cut and a wipe, and measure how they heal. Point clouds are
-    always damaged."""
+    """Also damage grown worlds by cuts and wipes, and measure how they heal: pictures and objects
+    near wounds spread over the body, textures as a whole. Point clouds are always damaged."""
     judge: bool = False
     """Textures only: also measure the texture metric: three distances from the target that no loss
     uses, as ratios: 1 is the distance of the target drawn by particles."""
@@ -69,6 +69,8 @@ def main(arguments: Sequence[str]) -> int:
     print(f"{options.rule}: {heading}")
     for name, table in tables.items():
         print(table_text(table, missing=UNMEASURED if name == "growth" else "never"))
+    for row in tables.get("healing", ()):
+        print(row.summary)
     if options.json_path is not None:
         write_text(options.json_path, tables_json(tables, metric=metric))
         print(f"wrote {options.json_path}")

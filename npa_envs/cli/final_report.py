@@ -103,7 +103,7 @@ def write_report(
 
     The folder gets the model card STEM.md, STEM.json as of `npa-envs evaluate --json`, STEM.gif,
     STEM.mp4 and STEM-filmstrip.png, for a 3D rule also a turntable and point files. On a CPU fewer
-    worlds are measured, for fewer steps and without damage, as they are slow there.
+    worlds are measured, for fewer steps, and only pictures and objects are damaged.
     """
     common.writable_folder(folder)
     rule = load_rule(path, device=device).float()
@@ -115,7 +115,8 @@ def write_report(
     with common.progress_bar(None, show=progress) as advance:
         tables = tables_of(
             rule, task, checkpoints=checkpoints, seeds=seeds, device=device, progress=advance,
-            changed=thorough and (clouds or task.aligned), texture_metric=task.has_texture_metric,
+            changed=task.grows_picture or (thorough and (clouds or task.aligned)),
+            texture_metric=task.has_texture_metric,
         )  # fmt: skip
         missing_films = _write_films(rule, task, path, folder, advance)
     if len(tasks := tasks_of_codes(str(path), rule, device)) > 1:
@@ -236,6 +237,8 @@ def _model_card(
     for name, table in tables.items():
         parts += [TITLES[name]] if name in TITLES else []
         parts.append(table_markdown(table, missing=UNMEASURED if name == "growth" else "never"))
+        if name == "healing":
+            parts.append("\n".join(f"- {row.summary}" for row in table))
     names = dict.fromkeys(
         field.name
         for table in tables.values()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import math
 import shlex
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields, make_dataclass, replace
 from pathlib import Path
 from typing import Any, Generic, TypeVar, get_type_hints
@@ -18,7 +18,7 @@ from npa_envs.cli import INTERRUPTED, common
 from npa_envs.errors import NPAError, shown
 from npa_envs.tasks.co_morphogenesis2d import CoMorphogenesis2DConfig
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2DConfig
-from npa_envs.tasks.train_config import COMMON, Common
+from npa_envs.tasks.train_config import COMMON, UNLISTED, Common
 from npa_envs.training import (
     TASKS,
     JointRules,
@@ -162,7 +162,9 @@ def _parse_fields(
     description = f"Train on {task_name}. Defaults shown are those of the preset."
     if {"-h", "--help"} & set(arguments):
         description += f" All options: npa-envs train {task_name} --help-all"
-        defaults = _with_common_fields(defaults)
+        defaults = _with_fields(defaults, lambda marks: COMMON in marks)
+    elif "--help-all" in arguments:
+        defaults = _with_fields(defaults, lambda marks: UNLISTED not in marks)
     examples = task_entry(task_name).examples
     lines = "".join(f"\n  npa-envs train {task_name} {words}" for words in examples)
     command_type: Any = Command
@@ -179,17 +181,17 @@ def _parse_fields(
     return command.run, command.training
 
 
-def _with_common_fields(config: Any) -> Any:
-    """Return an equal configuration, of a subclass whose help shows only the most used fields."""
+def _with_fields(config: Any, is_shown: Callable[[Sequence[object]], bool]) -> Any:
+    """Return an equal configuration, of a subclass whose help has fields by their marks alone."""
     cls: Any = type(config)
     suppress: Any = tyro.conf.Suppress
     types: dict[str, Any] = {}
     values = {one.name: getattr(config, one.name) for one in fields(config)}
     for name, hint in get_type_hints(cls, include_extras=True).items():
         if name == "task":
-            values["task"] = _with_common_fields(config.task)
+            values["task"] = _with_fields(config.task, is_shown)
             types["task"] = type(values["task"])
-        elif COMMON not in getattr(hint, "__metadata__", ()):
+        elif not is_shown(getattr(hint, "__metadata__", ())):
             types[name] = suppress[hint]
     changed = [(name, kind, field(default=values[name])) for name, kind in types.items()]
     base = cls[types["task"]] if getattr(cls, "__parameters__", ()) else cls

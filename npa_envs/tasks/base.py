@@ -13,13 +13,13 @@ from typing import Any, Generic, NamedTuple, Self, TypeVar
 import torch
 from torch import Tensor
 
-from npa_envs.checks import check_fraction, check_non_negative, check_positive
+from npa_envs.checks import check_flag, check_fraction, check_non_negative, check_positive
 from npa_envs.errors import NPAError, shown
 from npa_envs.ops import world_mean
 from npa_envs.rule.rule import COLOUR_OFFSET, NPARule
 from npa_envs.tasks.damage import DAMAGE_CHANCE, far_points, random_particle, tear_off
 from npa_envs.tasks.seeds import uniform_ball
-from npa_envs.tasks.train_config import Common
+from npa_envs.tasks.train_config import Common, Unlisted
 from npa_envs.world.brushes import clump, cut, wipe_state
 from npa_envs.world.particles import Particles
 from npa_envs.world.randomness import Randomness, uniform_draws
@@ -104,6 +104,10 @@ class ParticleTask(Generic[ConfigT]):
     aligned: bool = False
     """Whether worlds are compared with `target_picture` pixel by pixel, so a PSNR makes sense."""
 
+    grows_picture: bool = False
+    """Whether worlds grow one picture or object, so that healing is measured near wounds: the task
+    has `pixel_errors`, `pixels_near` and `spread_places`, as `Morphogenesis2D` explains them."""
+
     has_views: bool = False
     """Whether the task is a `Morphogenesis3D`, whose worlds are drawn from any camera."""
 
@@ -124,6 +128,7 @@ class ParticleTask(Generic[ConfigT]):
 
     _mean_of_processes: Callable[[Tensor], Tensor] | None = None
     _goal: Tensor | None = None
+    _wounds: tuple[Tensor, float] | None = None
     _target_picture: Tensor | None = None
     _pixel_size: float | None = None
 
@@ -268,6 +273,20 @@ class ParticleTask(Generic[ConfigT]):
         """
         return s
 
+    def wounds_between(self, before: Particles, after: Particles) -> Tensor:
+        """Return which pixels of each world's picture a damage has changed, uint8, [B, R, R]."""
+        raise NPAError(
+            f"wound_weight needs worlds that grow one upright picture each, got those of a "
+            f"{type(self).__name__}: leave it out"
+        )
+
+    def with_wounds(self, wounds: Tensor, weight: float) -> Self:
+        """Return a copy of the task whose loss also has, by `weight`, the mean over these pixels.
+
+        `wounds` are 0 or 1, uint8, shape [B, R, R], as of `wounds_between`, and read at each call.
+        """
+        return self._copy_with(_wounds=(wounds, weight))
+
     def held_out(self) -> Self:
         """Return the task with test data in place of training data; without data, itself."""
         return self
@@ -363,6 +382,9 @@ class GrowthConfig(TaskConfig):
     cut_share: float = DAMAGE_CHANCE
     """Probability that a world from the pool is cut (dimensionless)."""
 
+    cut_anywhere: Unlisted[bool] = False
+    """Cuts run through random particles. If False, they run through the centroid."""
+
     flake_radius: float = 0.0
     """Radius up to which a ball of particles is torn off and thrown out, in a quarter of the worlds
     from the pool [length units]; 0: none."""
@@ -391,6 +413,7 @@ class GrowthConfig(TaskConfig):
     def __post_init__(self) -> None:
         super().__post_init__()
         check_fraction(self, "cut_share")
+        check_flag(self, "cut_anywhere")
         check_non_negative(self, "damage_radius", "clump_radius", "cut_gap", "flake_radius")
         check_positive(self, int, "state_dim", at_least=3)
         check_positive(self, int, "resolution", at_least=8)
@@ -438,7 +461,8 @@ class GrowthTask(ParticleTask[GrowthConfigT]):
             # Directions need not be uniform; a zero vector cuts nothing.
             normal = 2.0 * uniform_draws(generator, (len(x), x.shape[2]), x) - 1.0
             hit = chosen_worlds(config.cut_share)
-            x, s = cut(x, s, centre=world_mean(x), normal=normal, gap=config.cut_gap * hit)
+            centre = random_particle(x, generator) if config.cut_anywhere else world_mean(x)
+            x, s = cut(x, s, centre=centre, normal=normal, gap=config.cut_gap * hit)
         if config.flake_radius > 0.0:
             x = tear_off(x, radius=config.flake_radius, generator=generator)
         if config.escape_share > 0.0:

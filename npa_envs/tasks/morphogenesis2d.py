@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Self
 
 import torch
 from torch import Tensor
+from torch.nn import functional
 
 from npa_envs.checks import (
     are_texts,
@@ -25,6 +26,7 @@ from npa_envs.ops.world_mean import scalar_world_mean
 from npa_envs.rule.picture_codes import replace_code
 from npa_envs.rule.rule import COLOUR_OFFSET, LIFE, NPARule
 from npa_envs.tasks.base import GrowthConfig, GrowthTask
+from npa_envs.tasks.seeds import spread_points
 from npa_envs.tasks.targets.images import MAX_POINT_COUNT
 from npa_envs.tasks.targets.picture_points import PointTarget, load_target
 from npa_envs.tasks.train_config import Common, TrainConfig, fast_run, presets_of, tiny_run
@@ -156,6 +158,12 @@ FINER_TIMES = 4
 SURVIVING = 0.5
 """Probability that a particle survives damage, in worlds whose particles divide."""
 
+WOUND_CHANGE = 0.1
+"""A pixel is part of a wound if damage changes its colours and density by more than this in sum."""
+
+WIDEST_WOUND = 0.35
+"""Fraction of the pixels beyond which a change of a picture has no place and counts as no wound."""
+
 FAR_AWAY = 1e3
 """Coordinate to which dead particles are moved, out of every picture [length units]."""
 
@@ -168,6 +176,7 @@ class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
     """The task of growing a picture of arXiv 2601.16096, section 4.1, with its loss."""
 
     metric_name = "splat loss"
+    grows_picture = True
     _code: Tensor | None = None
 
     def __init__(
@@ -290,6 +299,35 @@ class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
         red, green, blue, density = (size + size * size).unbind(dim=-1)
         return density, (red + green + blue) / 3.0 * torch.exp(-density.detach())
 
+    def pixel_errors(self, x: Tensor, s: Tensor) -> Tensor:
+        """Return each pixel's splat loss, whose mean is `metric`, dimensionless, [B, R, R]."""
+        density, colour = self.splat_errors(x, s)
+        return density + self.config.colour_weight * colour
+
+    def pixels_near(
+        self, worlds: Particles, distance: Callable[[Tensor], Tensor], margin: float
+    ) -> Tensor:
+        """Return at which pixels of `pixel_errors` there is a point nearer than `margin`, bool.
+
+        `distance` maps points [B, M, D] in the worlds to distances [B, M] [length units].
+        """
+        side = self.config.resolution
+        at = torch.linspace(-1.0, 1.0, side, device=worlds.x.device, dtype=worlds.x.dtype)
+        grid = torch.stack(torch.meshgrid(at, at, indexing="xy"), dim=-1).flatten(0, 1)
+        return (distance(self._in_worlds(grid, worlds)) < margin).view(-1, side, side)
+
+    def spread_places(self, count: int, worlds: Particles) -> Tensor:
+        """Return places in each world, spread over its body, [length units], [B, count, D]."""
+        return self._in_worlds(spread_points(self.target.points, count), worlds)
+
+    def _in_worlds(self, points: Tensor, worlds: Particles) -> Tensor:
+        """Return where points [M, 2] of the target lie in worlds that match it, [B, M, 2]."""
+        x, s, *_ = worlds
+        points = (points - self._target_mean).to(x).expand(len(x), -1, -1)
+        if self._tries_angles:
+            points = turned(points, self.best_turn(x, s).mT)
+        return points + world_mean(x)[:, None]
+
     def splat_losses(self, x: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
         """Return each world's density loss and colour loss, means of `splat_errors`, [B] each."""
         with_gradient = torch.is_grad_enabled() and (x.requires_grad or s.requires_grad)
@@ -305,9 +343,32 @@ class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
 
     def compare(self, worlds: Particles) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the batch's weighted splat loss, [], and its terms "density" and "colour", []."""
-        density, colour = (term.mean() for term in self.splat_losses(worlds.x, worlds.s))
-        total = self.config.splat_weight * (density + self.config.colour_weight * colour)
-        return total, {"density": density, "colour": colour}
+        config, x, s = self.config, worlds.x, worlds.s
+        if self._wounds is None:
+            density, colour = (term.mean() for term in self.splat_losses(x, s))
+            total = config.splat_weight * (density + config.colour_weight * colour)
+            return total, {"density": density, "colour": colour}
+        each, (wounds, weight) = self.splat_errors(x, s), self._wounds
+        density, colour = (scalar_world_mean(errors).mean() for errors in each)
+        wound = local_means(each[0] + config.colour_weight * each[1], wounds).mean()
+        total = density + config.colour_weight * colour + weight * wound
+        return config.splat_weight * total, {"density": density, "colour": colour, "wound": wound}
+
+    @torch.no_grad()
+    def wounds_between(self, before: Particles, after: Particles) -> Tensor:
+        """Return which pixels of each world's picture a damage has changed, uint8, [B, R, R].
+
+        Pixels around them are included, by a square of ε / 2. Pictures are centred as worlds were
+        before. A world whose picture changed nearly everywhere has no such pixels.
+        """
+        if self._tries_angles:
+            return super().wounds_between(before, after)
+        shift = (self._target_mean.to(before.x) - world_mean(before.x))[:, None]
+        old, new = (self.picture(w.x + shift, w.s, centred=False) for w in (before, after))
+        changed = ((new - old).abs().sum(dim=-1) > WOUND_CHANGE).to(old.dtype)
+        margin = round(self.eps * self.config.resolution / 8.0)
+        near = functional.max_pool2d(changed[:, None], 2 * margin + 1, 1, margin)[:, 0]
+        return (near * (near.mean((1, 2), keepdim=True) < WIDEST_WOUND)).to(torch.uint8)
 
     @property
     def rule_shape(self) -> dict[str, Any]:
@@ -344,8 +405,7 @@ class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
         `metric`, up to rounding.
         """
         with torch.no_grad():
-            density, colour = self.splat_errors(x, s)
-            errors = density + self.config.colour_weight * colour
+            errors = self.pixel_errors(x, s)
         blank = x.new_zeros(*x.shape[:2], 3).requires_grad_()
         with torch.enable_grad():
             picture = self._splat(self._aligned(x.detach(), s), blank)
@@ -419,6 +479,16 @@ class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
             pixel_size=self.pixel_size,
             sigma=self.config.sigma,
         )
+
+
+def local_means(errors: Tensor, places: Tensor) -> Tensor:
+    """Return each world's mean of errors [B, ...] over pixels where `places` is 1, else 0, [B].
+
+    It is 0 for a world without such pixels.
+    """
+    places = places.to(errors.dtype)
+    share = scalar_world_mean(places).clamp_min(1.0 / places[0].numel())
+    return scalar_world_mean(errors * places) / share
 
 
 def turns(angle: Tensor, hand: Tensor) -> Tensor:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, Self
 
@@ -20,12 +20,13 @@ from npa_envs.checks import (
     check_text,
 )
 from npa_envs.errors import NPAError
-from npa_envs.ops import Cameras, render_gaussians
+from npa_envs.ops import Cameras, render_gaussians, world_mean
 from npa_envs.ops.world_mean import scalar_world_mean
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.base import GrowthConfig, GrowthTask, contributions_to_loss
-from npa_envs.tasks.gaussian_outputs import OUTPUTS, Gaussians, appearance
+from npa_envs.tasks.gaussian_outputs import HARMONIC_0, OUTPUTS, Gaussians, appearance
 from npa_envs.tasks.losses.ms_ssim import MultiScaleSimilarity
+from npa_envs.tasks.seeds import spread_points
 from npa_envs.tasks.targets.views import (
     Views,
     ViewTarget,
@@ -142,6 +143,7 @@ class Morphogenesis3D(GrowthTask[Morphogenesis3DConfig]):
     space_dim = 3
     metric_name = "view loss"
     has_views = True
+    grows_picture = True
     _resized_with = ("target",)
     _rule: NPARule | None = None
 
@@ -240,6 +242,40 @@ class Morphogenesis3D(GrowthTask[Morphogenesis3DConfig]):
         error = composited(views, white).clamp(0.0, 1.0) - composited(targets, white)
         return (-10.0 * error.square().mean(dim=(2, 3, 4)).log10()).mean(dim=1)
 
+    def pixel_errors(self, x: Tensor, s: Tensor) -> Tensor:
+        """Return each pixel's error in each held-out view, as in `metric`, [B, V, H, W].
+
+        It is the mean |difference| of colours and alpha.
+        """
+        drawn, pictures = self._views_on(
+            x, self.gaussians(s), self.target.held_out, x.new_full((3,), GREY)
+        )
+        return (drawn - pictures).abs().mean(dim=-1)
+
+    def pixels_near(
+        self, worlds: Particles, distance: Callable[[Tensor], Tensor], margin: float
+    ) -> Tensor:
+        """Return at which pixels particles nearer than `margin` are most of what is seen, bool.
+
+        `distance` maps points [B, M, D] in the worlds to distances [B, M] [length units].
+        """
+        looks = self.gaussians(worlds.s)
+        colours = torch.zeros_like(looks.colours)
+        # Drawn white on black; the renderer adds one half.
+        near = (distance(worlds.x) < margin).to(colours.dtype)
+        colours[..., 0, :] = ((near - 0.5) / HARMONIC_0)[..., None]
+        cameras = self.target.held_out.cameras
+        views = self._draw(worlds.x, looks._replace(colours=colours), cameras)
+        return views[..., 0] > 0.5 * views[..., 3].clamp_min(0.1)
+
+    def spread_places(self, count: int, worlds: Particles) -> Tensor:
+        """Return particles of each world, spread over its body, [length units], [B, count, D]."""
+        away = torch.linalg.vector_norm(worlds.x - world_mean(worlds.x)[:, None], dim=-1)
+        # Without the few that are farthest, which may have escaped.
+        bodies = away.argsort(dim=1)[:, : max(1, round(0.99 * away.shape[1]))]
+        pairs = zip(worlds.x, bodies, strict=True)
+        return torch.stack([spread_points(x[body], count) for x, body in pairs])
+
     def particle_contributions(self, x: Tensor, s: Tensor) -> Tensor:
         """Return N times each particle's contribution to its world's `metric`, shape [B, N].
 
@@ -276,6 +312,16 @@ class Morphogenesis3D(GrowthTask[Morphogenesis3DConfig]):
         pictures = render_gaussians(x, *gaussians[:4], cameras.to(x))
         return torch.cat((pictures.image, pictures.alpha[..., None]), dim=-1)
 
+    def _views_on(
+        self, x: Tensor, gaussians: Gaussians, target: Views, background: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Return views of worlds, [B, V, H, W, 4], and the target's, colours on a background."""
+        drawn, pictures = (
+            torch.cat((composited(views, background), views[..., 3:]), dim=-1)
+            for views in (self._draw(x, gaussians, target.cameras), target.pictures.to(x))
+        )
+        return drawn, pictures
+
     def _compare(
         self, x: Tensor, gaussians: Gaussians, target: Views, background: Tensor
     ) -> dict[str, Tensor]:
@@ -284,10 +330,7 @@ class Morphogenesis3D(GrowthTask[Morphogenesis3DConfig]):
         "views" is the mean |difference| of colours and alpha. "structure" is 1 − MS-SSIM, which is
         there if its weight is not 0.
         """
-        drawn, pictures = (
-            torch.cat((composited(views, background), views[..., 3:]), dim=-1)
-            for views in (self._draw(x, gaussians, target.cameras), target.pictures.to(x))
-        )
+        drawn, pictures = self._views_on(x, gaussians, target, background)
         size = (drawn - pictures).abs()
         terms = {"views": scalar_world_mean(size)}
         if self._similarity is not None:

@@ -84,6 +84,21 @@ def drawn_worlds(x: Tensor, generator: Randomness, probability: float) -> Tensor
     return uniform_draws(generator, (len(x), 1), single)[:, 0] < probability
 
 
+def spread_points(points: Tensor, count: int) -> Tensor:
+    """Return `count` of points [M, D], each the farthest from those before it, [count, D].
+
+    The first one is random, and the same for equally many points.
+    """
+    first = int(torch.randint(len(points), (1,), generator=torch.Generator().manual_seed(1)))
+    chosen = [points[first]]
+    distance = torch.full_like(points[:, 0], torch.inf)
+    while len(chosen) < count:
+        away = torch.linalg.vector_norm(points - chosen[-1], dim=-1)
+        distance = torch.minimum(distance, away)
+        chosen.append(points[distance.argmax()])
+    return torch.stack(chosen)
+
+
 def _checked_shape(
     world_count: int,
     particle_count: int,

@@ -32,7 +32,12 @@ FieldT = TypeVar("FieldT")
 
 COMMON = "shown by --help"
 Common = Annotated[FieldT, COMMON]
-"""Type of a field that `npa-envs train TASK --help` shows; `--help-all` shows all fields."""
+"""Type of a field that `npa-envs train TASK --help` shows; `--help-all` shows all fields
+that are not `Unlisted`."""
+
+UNLISTED = "shown by no help"
+Unlisted = Annotated[FieldT, UNLISTED]
+"""Type of a field whose option `npa-envs train` takes but does not show; pages name it."""
 
 Schedule = Literal["milestones", "cosine"]
 """Learning-rate schedules."""
@@ -148,6 +153,18 @@ class TrainConfig(Generic[TaskConfigT]):
     stillness_min_age: int = 512
     """Age [steps], also since the damage before another lifetime, from which a world is grown."""
 
+    wound_chance: Unlisted[float] = 0.0
+    """Probability that a world of at least `wound_min_age` is damaged when a batch has it, and
+    keeps its age (dimensionless). Needs `max_age_range`."""
+
+    wound_min_age: Unlisted[int] = 256
+    """Age [steps] from which `wound_chance` damages a world."""
+
+    wound_weight: Unlisted[float] = 0.0
+    """Weight of each world's mean loss over the pixels that its last damage changed, relative to
+    the whole picture's loss (dimensionless). The pool stores these pixels until the world is
+    replaced. For pictures; needs `max_age_range`."""
+
     damage_share: float = 1.0
     """Fraction in [0, 1] of the pool whose worlds are damaged in every batch, so that a rule learns
     to heal: the first indices, which with `max_age_range` have the shortest lifetimes. All others
@@ -187,12 +204,12 @@ class TrainConfig(Generic[TaskConfigT]):
     def __post_init__(self) -> None:
         check_positive(self, int, "iterations", "repeats", "world_count", "pool_size")
         check_positive(self, int, "seed_interval", "log_interval", "checkpoint_interval")
-        check_positive(self, int, "stillness_min_age")
+        check_positive(self, int, "stillness_min_age", "wound_min_age")
         check_positive(self, int, "picture_interval", at_least=0)
         check_positive(self, float, "learning_rate", "stillness_power")
         check_non_negative(self, "weight_decay", "stillness_weight", "dead_zone")
-        check_non_negative(self, "damage_and_keep_share")
-        check_non_negative(self, "fresh_share", "damage_share", at_most=1.0)
+        check_non_negative(self, "damage_and_keep_share", "wound_weight")
+        check_non_negative(self, "fresh_share", "damage_share", "wound_chance", at_most=1.0)
         check_seed(self, "seed")
         check_flag(self, "cuda_graph", "tensorboard")
         parse_device(self.device)
@@ -208,7 +225,8 @@ class TrainConfig(Generic[TaskConfigT]):
         check("vary_eps", fits, "be two factors (lo, hi) with 0 < lo <= hi", hint)
         is_path = isinstance(self.out, Path)
         check("out", is_path, "be a pathlib.Path", f"Path({shown(self.out)})")
-        for name in ("stillness_weight", "damage_and_keep_share"):
+        aged = ("stillness_weight", "damage_and_keep_share", "wound_chance", "wound_weight")
+        for name in aged:
             if getattr(self, name) > 0 and not self.ages:
                 raise NPAError(
                     f"{name} needs max_age_range, got {getattr(self, name)} without: "
@@ -254,7 +272,7 @@ class TrainConfig(Generic[TaskConfigT]):
     @property
     def damages(self) -> bool:
         """Whether any world of the pool is ever damaged."""
-        return self.damage_share > 0.0 or self.damage_and_keep_share > 0.0
+        return max(self.damage_share, self.damage_and_keep_share, self.wound_chance) > 0.0
 
     @property
     def fresh_count(self) -> int:

@@ -60,6 +60,8 @@ class WorldPool:
         """Steps since the start world, or the last damage that ended a lifetime, int64, [W]."""
         self.lifetime: Tensor | None = None
         """Age at which each world is replaced or damaged [steps], int64, shape [W]."""
+        self.wounds: Tensor | None = None
+        """Pixels that each world's last damage changed, uint8, [W, R, R]; None: not needed."""
         x = worlds.x
         if max_age_range is not None:
             self.age = torch.zeros_like(x[:, 0, 0], dtype=torch.int64)
@@ -69,7 +71,7 @@ class WorldPool:
 
     def tensors(self) -> dict[str, Tensor]:
         """Return the worlds' tensors and their ages by name, for a checkpoint."""
-        tensors = self.worlds._asdict() | {"age": self.age}
+        tensors = self.worlds._asdict() | {"age": self.age, "wounds": self.wounds}
         return {name: value for name, value in tensors.items() if value is not None}
 
     def sample(self, world_count: int, generator: torch.Generator) -> Tensor:
@@ -96,9 +98,14 @@ class WorldPool:
         return age, age >= self.lifetime.index_select(0, index)
 
     def write(
-        self, index: Tensor, worlds: Particles, replacements: Particles, age: Tensor | None = None
+        self,
+        index: Tensor,
+        worlds: Particles,
+        replacements: Particles,
+        age: Tensor | None = None,
+        wounds: Tensor | None = None,
     ) -> Tensor:
-        """Store B worlds and their ages at `index`, and replacements where a world has diverged.
+        """Store B worlds with ages and wounds at `index`, replacements where one has diverged.
 
         Returns which worlds were replaced, bool, shape [B].
         """
@@ -111,6 +118,9 @@ class WorldPool:
         self.worlds.put_(index, replacements.where(diverged, worlds))
         if self.age is not None and age is not None:
             self.age.index_copy_(0, index, age.masked_fill(diverged, 0))
+        if self.wounds is not None and wounds is not None:
+            wounds = wounds.masked_fill(diverged[:, None, None], 0)
+            self.wounds.index_copy_(0, index, wounds)
         return diverged
 
 
@@ -160,6 +170,9 @@ class TrainingCycle:
             rollout_particles if rollout is None else rollout,
             take_means=None if processes.count == 1 else processes.reduce,
         )
+        if self.batch.wounds is not None:
+            shape = len(self.pool.worlds.x), *self.batch.wounds.shape[1:]
+            self.pool.wounds = self.batch.wounds.new_zeros(shape)
         self.optimiser = RuleOptimiser(self.batch.parameters, config, rule)
         self.statistics = LossStatistics(self.batch)
         # What graphs share: `_draw_worlds` writes the batch's indices in the pool, ages and start
@@ -247,7 +260,7 @@ class TrainingCycle:
         by_section = config.ages or self._per_world_streams
         sample: Any = self.pool.sample_sections if by_section else self.pool.sample
         self._index.copy_(sample(len(self._index), random))
-        worlds = self.pool.worlds.take(self._index)
+        before = worlds = self.pool.worlds.take(self._index)
         damaged, expired = self._damaged_and_expired(worlds)
         if config.damages:
             after = self.task.damage(worlds, random)
@@ -258,6 +271,13 @@ class TrainingCycle:
         if expired is not None:
             worlds = start_worlds.where(expired, worlds)
         self.batch.start.copy_(worlds)
+        if self.batch.wounds is not None and self.pool.wounds is not None:
+            assert expired is not None, "a weight of wounds needs max_age_range"
+            wounds = self.task.wounds_between(before, worlds)
+            old = self.pool.wounds.index_select(0, self._index)
+            hurt = wounds.amax((1, 2), keepdim=True) > 0
+            wounds = torch.where(hurt, wounds, old)
+            self.batch.wounds.copy_(wounds.masked_fill(expired[:, None, None], 0))
 
     def _damaged_and_expired(self, worlds: Particles) -> tuple[Tensor, Tensor | None]:
         """Return which worlds of the batch to damage, and which to replace; set all ages."""
@@ -267,6 +287,9 @@ class TrainingCycle:
             return damaged, None
         age, expired = self.pool.ages_of(self._index)
         self._age.copy_(age.masked_fill(expired, 0))
+        if config.wound_chance > 0.0:
+            chance = uniform_draws(self.random.worlds, (len(expired), 1), worlds.x)[:, 0]
+            damaged |= (chance < config.wound_chance) & (self._age >= config.wound_min_age)
         self.batch.past_min_age.copy_((self._age >= config.stillness_min_age) & ~damaged)
         if config.damage_and_keep_share > 0.0:
             chance = uniform_draws(self.random.worlds, (len(expired), 1), worlds.x)[:, 0]
@@ -277,7 +300,8 @@ class TrainingCycle:
     @torch.no_grad()
     def _store_worlds(self) -> None:
         age = self._age + self._steps if self._config.ages else None
-        replaced = self.pool.write(self._index, self.batch.end, self._start_worlds, age)
+        written = self._index, self.batch.end, self._start_worlds, age, self.batch.wounds
+        replaced = self.pool.write(*written)
         self._replaced += replaced.sum()
 
     @torch.no_grad()

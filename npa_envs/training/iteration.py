@@ -64,6 +64,11 @@ class EagerIteration:
         task = task.with_goal(self.start.goal)
         self.past_min_age = torch.zeros_like(worlds.x[:, 0, 0], dtype=torch.bool)
         """Worlds to which the stillness loss applies, bool, shape [B]."""
+        self.wounds: Tensor | None = None
+        """Pixels that each world's last damage changed, uint8, [B, R, R]; None: without weight."""
+        if config.wound_weight > 0.0:
+            self.wounds = task.wounds_between(worlds, worlds)
+            task = task.with_wounds(self.wounds, config.wound_weight)
         self._config = config
         self._divides = bool(fate_parameters(rule))
         self._task = task

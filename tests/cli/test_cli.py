@@ -96,6 +96,9 @@ def test_help_of_train_shows_the_most_used_options_and_help_all_all_of_them(caps
         assert ("--splat-weight" in text) == (word == "--help-all")
     assert "--help-all" not in text.partition("Examples")[0]
     assert counts == [25, 76]
+    assert "--wound-weight" not in text
+    first = common.first_options(["--wound-weight", "0.5", "--max-age-range", "16", "64"])
+    assert parse_run("morphogenesis2d", first)[1].wound_weight == 0.5
     text = help_of(capsys, "train", "texture", "--help")
     for option in ("preset", "target", "iterations", "device", "out", "config", "resume"):
         assert len(re.findall(rf"^[ │|]{{1,3}}--{option}[ ,]", text, re.MULTILINE)) == 1

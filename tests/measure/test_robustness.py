@@ -151,6 +151,27 @@ def test_recovery_is_the_first_step_within_a_tenth_of_the_undamaged_copy(losses,
     assert curve.recovery_steps() == [step]
 
 
+@pytest.mark.parametrize(
+    ("near", "step", "cell"),
+    [
+        ([9.0, 2.0, 1.0, 0.5], 32, "1/1, 32"),
+        # What comes back and goes again has not recovered.
+        ([9.0, 0.5, 0.5, 1.1], None, "0/1"),
+        ([9.0, 0.5, 1.5, 0.9], 64, "1/1, 64"),
+        ([9.0, math.nan, math.nan, math.nan], None, "0/1"),
+        # A damage that changed nothing does not count.
+        ([0.9, 0.9, 0.9, 0.9], 0, "0/0"),
+    ],
+)
+def test_recovery_near_a_wound_is_the_step_from_which_on_the_loss_is_within_its_bound(
+    near, step, cell
+):
+    losses = ([1.0] * 4,)
+    curve = trials.LossCurve("wipe", (0, 16, 32, 64), losses, losses, (near,))
+    assert curve.recovery_steps() == [step]
+    assert f"| heart | {cell} |" in report.tables([record(curve)])
+
+
 def record(*found: trials.LossCurve, **changed) -> report.RuleRecord:
     values = [("eps", 1.0), ("eps", 2.0), ("particles", 1.0), ("update_prob", 0.5)]
     responses = tuple(report.Response(name, value, 8, (0.5, value)) for name, value in values)
@@ -217,6 +238,10 @@ def test_damaged_worlds_go_beside_twins_with_the_same_masks(name, device):
     undamaged = found["wipe"].undamaged
     assert undamaged == found[trials.CONTROL].undamaged == found["noise"].undamaged
     assert tuple(curve[0] for curve in undamaged) == pytest.approx(trained.losses, rel=1e-6)
+    # Of a picture the loss near the wound counts, where there is one.
+    near = {name for name, curve in found.items() if curve.near}
+    assert near == ({"wipe", "cut", "clump"} if name == "heart" else set())
+    assert all(torch.tensor(found[name].near).shape == (2, 3) for name in near)
     # At first the control is its undamaged copy; then masks are others.
     assert found[trials.CONTROL].ratios(0) == [1.0, 1.0]
     if not static:
@@ -284,7 +309,7 @@ def test_seeds_of_a_rule_of_many_pictures_grow_them_in_turn(device):
     assert torch.equal(one.s, trial.initial_worlds(0.5).s[3:])
     # What takes codes away gives them back.
     curves = trials.healing(trial, report.grow(trial)[0])
-    assert all(len(curve.losses) == 4 for curve in curves)
+    assert all(len(curve.losses) == 4 and not curve.near for curve in curves)
 
 
 def test_a_world_that_diverges_stays_lost_and_leaves_the_others_as_they_are(device, monkeypatch):

@@ -55,6 +55,7 @@ LAYERS = {
     "npa_envs.measure.plots": Layer(2, "matplotlib"),
     "npa_envs.measure.process_queue": Layer(1),
     "npa_envs.measure.texture_metric": Layer(10, "torch", never=INSIDES),
+    "npa_envs.measure.wounds": Layer(10, "torch", never=INSIDES),
     "npa_envs.measure.quality": Layer(11, "torch numpy tqdm", never=INSIDES),
     "npa_envs.measure.rule_interaction": Layer(12, "torch numpy matplotlib", never=ORACLES),
     "npa_envs.measure.speed": Layer(13, "torch numpy matplotlib", never=("npa_envs.kernels",)),

@@ -87,6 +87,17 @@ def test_as_many_worlds_are_hit_as_asked_for(fields, fraction, space_dim):
     assert torch.equal(damaged.s, before.s)
 
 
+@pytest.mark.parametrize("anywhere", [False, True])
+def test_cuts_run_through_the_middle_or_anywhere(anywhere):
+    before = worlds(60)
+    fields = {"cut_gap": 0.4, "cut_share": 1.0, "cut_anywhere": anywhere}
+    damaged = damaged_in_pool(before, seeded(2), **fields)
+    # A slit through the centroid moves half of the particles to each side.
+    moved = (damaged.x - before.x).norm(dim=-1)
+    fewer = (moved > 0.1).float().mean(dim=1)
+    assert (float(fewer.std()) > 0.04) == anywhere
+
+
 def test_a_clump_is_one_point():
     x, s, *_ = worlds(40)
     damaged, *_ = damaged_in_pool(Particles(x, s), seeded(2), clump_radius=0.3)

@@ -32,6 +32,10 @@ SEEDED |= {"world_count": 4, "pool_size": 8}
 ESCAPING = {"escape_share": 0.1, "escape_weight": 10.0, "world_count": 4, "pool_size": 8}
 """Worlds that lose particles, some more than others."""
 
+WOUNDED = LIVELY | {"wound_chance": 0.5, "wound_min_age": 4, "wound_weight": 0.5}
+WOUNDED |= {"cut_gap": 0.1, "cut_anywhere": True, "damage_radius": 0.2}
+"""Worlds that remember the pixels of their last wound."""
+
 
 FEW = {"iterations": 3, "steps": (3, 5)}
 BASE = {"iterations": 5, "milestones": [2], "dtype": "float64", "steps": (3, 6)}
@@ -82,7 +86,7 @@ def loaded_kernels(tmp_path_factory):
 
 
 CASES = [
-    *(("morphogenesis2d", fields, 1e-10) for fields in ({}, LIVELY, SEEDED, ESCAPING)),
+    *(("morphogenesis2d", fields, 1e-10) for fields in ({}, LIVELY, SEEDED, ESCAPING, WOUNDED)),
     # Its 16-bit numbers would differ between processes that did not step together.
     ("morphogenesis2d", {"optimiser": "muon", "learning_rate": 5e-3}, 1e-2),
     *(pytest.param(task, FEW | SEEDED, 1e-10, marks=pytest.mark.slow) for task in TASKS),

@@ -94,6 +94,8 @@ REFUSED = [
     ({"damage_and_keep_share": 1.0}, "damage_and_keep_share must be below 1, got 1.0"),
     ({"damage_and_keep_share": 0.5}, "damage_and_keep_share needs max_age_range, got 0.5 without"),
     ({"stillness_weight": 64}, "stillness_weight needs max_age_range, got 64"),
+    ({"wound_weight": 0.5}, "wound_weight needs max_age_range, got 0.5"),
+    ({"wound_chance": 1.5}, "wound_chance must"),
     (
         {"max_age_range": [64, 128], "pool_size": 36},
         "pool_size must be a multiple of world_count where",

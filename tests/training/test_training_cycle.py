@@ -15,6 +15,9 @@ from npa_envs.training.iteration import EagerIteration, GraphedIteration
 from npa_envs.world.particles import Particles
 from npa_envs.world.rollout import rollout_particles
 
+WOUNDED = {"max_age_range": (4, 400), "damage_share": 0.25, "cut_gap": 0.1, "cut_anywhere": True}
+WOUNDED |= {"wound_chance": 0.5, "wound_min_age": 4, "wound_weight": 0.5}
+
 
 def circle_cycle(tmp_path, **fields):
     fields = {"seed_interval": 3, "iterations": 5, "repeats": 2, "milestones": [2]} | fields
@@ -65,6 +68,8 @@ def clouds_cycle(tmp_path, per_world_streams=False, **fields):
         (tiny_cycle, {"max_age_range": (4, 40), "damage_share": 0.5, "damage_and_keep_share": 0.5}),
         (tiny_cycle, {"max_age_range": (4, 40), "damage_share": 0.0, "damage_and_keep_share": 0.5}),
         (tiny_cycle, {"vary_eps": (0.5, 2.0)}),
+        (tiny_cycle, WOUNDED),
+        (world_cycle, WOUNDED | {"damage_and_keep_share": 0.5}),
         (world_cycle, {"damage_share": 0.5}),
         (world_cycle, {"max_age_range": (4, 400), "vary_eps": (0.5, 2.0)}),
         (clouds_cycle, {"per_world_streams": True, "pool_size": 16}),

@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from datetime import date
+from itertools import compress
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -108,7 +109,9 @@ class RuleRecord(Record[Response]):
         self.curves = []
         for row in content.pop("courses"):
             losses, undamaged = (tuple(map(numbers, row[name])) for name in ("losses", "twins"))
-            self.curves.append(LossCurve(row["damage"], tuple(row["steps"]), losses, undamaged))
+            near = tuple(map(numbers, row.get("near", ())))
+            curve = LossCurve(row["damage"], tuple(row["steps"]), losses, undamaged, near)
+            self.curves.append(curve)
         rows = content.pop("responses")
         del content["facts"]
         self.about = content
@@ -224,7 +227,8 @@ def tables(records: Sequence[RuleRecord]) -> str:
     parts = [
         "Where rules work: values at which the mean loss is at most "
         f"{WORKS:g} times that under training conditions and all seeds are finite:\n\n{works}",
-        f"Recovered seeds, and their median recovery time [steps]:\n\n{_by_damage(records)}",
+        "Recovered of the seeds that the damage changed, and their median recovery time [steps]:"
+        f"\n\n{_by_damage(records)}",
     ]
     for condition, summary in CONDITIONS.items():
         if table := _by_value(records, condition):
@@ -239,9 +243,10 @@ def _by_damage(records: Sequence[RuleRecord]) -> str:
     for record in records:
         cells = dict.fromkeys(names, NONE)
         for curve in record.curves:
-            steps = [step for step in curve.recovery_steps() if step is not None]
+            counted = [*compress(curve.recovery_steps(), curve.changed())]
+            steps = [step for step in counted if step is not None]
             time = f", {median(steps):g}" if steps else ""
-            cells[curve.damage] = f"{len(steps)}/{len(curve.losses)}{time}"
+            cells[curve.damage] = f"{len(steps)}/{len(counted)}{time}"
         rows.append([record.rule, *cells.values()])
     return markdown_table(["rule", *names], rows)
 

@@ -18,6 +18,7 @@ from torch import Tensor
 from npa_envs.errors import NPAError
 from npa_envs.measure.accuracy.trained_rule_checks import MIN_VIEWS, task_name
 from npa_envs.measure.quality import RuleRunner
+from npa_envs.measure.wounds import LocalLoss, Wound
 from npa_envs.ops import world_mean
 from npa_envs.rule.files import load_rule
 from npa_envs.rule.rule import NPARule
@@ -257,12 +258,18 @@ class RuleTrial:
 
     @torch.no_grad()
     def run(
-        self, initial: Particles, random: WorldRandom, steps: Sequence[int], **changed: Any
+        self,
+        initial: Particles,
+        random: WorldRandom,
+        steps: Sequence[int],
+        watch: Callable[[Particles], None] = lambda worlds: None,
+        **changed: Any,
     ) -> tuple[Particles, Tensor]:
         """Return worlds after the last of `steps`, and losses at each of them, [len(steps), B].
 
-        `changed` are options of `rollout` that replace the task's. A world that is not finite has
-        the loss NaN from then on, and does not affect the others.
+        `watch` is called with the worlds at each of them. `changed` are options of `rollout` that
+        replace the task's. A world that is not finite has the loss NaN from then on, and does not
+        affect the others.
         """
         task = self.tasks_of(initial.x.shape[1])[0]
         runner = RuleRunner(self.rule, task, random, **changed)
@@ -272,6 +279,7 @@ class RuleTrial:
             worlds = runner.run(worlds, step - before)
             diverged = diverged | divergence(worlds.x, worlds.s).non_finite
             worlds = initial.where(diverged, worlds)
+            watch(worlds)
             values = self.losses(worlds, changed.get("eps", task.eps))
             losses.append(torch.where(diverged, torch.nan, values))
         return worlds, torch.stack(losses)
@@ -293,6 +301,21 @@ class RuleTrial:
                 chosen = worlds.take(some)
                 losses[some] = task.with_goal(chosen.goal).trial_metric(chosen)
         return losses
+
+    def wound(self, damage: str, x: Tensor) -> Wound | None:
+        """Return what a kind of `DAMAGES` does to worlds at `x`, if it has a place; else None.
+
+        Rules of one picture or object have wounds; of the others whole worlds are compared.
+        """
+        if not self.task.grows_picture or len(self._tasks[self.particle_count]) > 1:
+            return None
+        random = self.random(StreamId.DAMAGE)
+        if damage == "cut":
+            normal = random.normal(x.shape[2], dtype=x.dtype)
+            return Wound(damage, world_mean(x), DAMAGE_SIZES[damage], normal)
+        if damage in ("wipe", "clump"):
+            return Wound(damage, random_particle(x, random), DAMAGE_SIZES[damage])
+        return None
 
     def by_seed(self, losses: Tensor) -> Tensor:
         """Return the mean loss of each seed's worlds, [..., seeds], of losses [..., B]."""
@@ -400,10 +423,24 @@ class LossCurve:
     steps: tuple[int, ...]
     losses: tuple[tuple[float, ...], ...]
     undamaged: tuple[tuple[float, ...], ...]
+    near: tuple[tuple[float, ...], ...] = ()
+    """Loss near each seed's wound over its bound (`LocalLoss`); (): the damage has no place."""
+
+    def changed(self) -> list[bool]:
+        """Return for each seed whether the damage counts: it raised the loss near it enough."""
+        return [not row[0] <= 1.0 for row in self.near] or [True] * len(self.losses)
 
     def recovery_steps(self) -> list[int | None]:
-        """Return for each seed the first of `steps` at which it has recovered; None: never."""
+        """Return for each seed the first of `steps` at which it has recovered; None: never.
+
+        With `near`, it is the first one from which on the loss near the wound is within its bound.
+        """
         first: list[int | None] = []
+        for row in self.near:
+            late = [step for step, value in zip(self.steps, row, strict=True) if not value <= 1.0]
+            first.append(next((s for s in self.steps if not late or s > late[-1]), None))
+        if self.near:
+            return first
         for losses, undamaged in zip(self.losses, self.undamaged, strict=True):
             # Comparisons with NaN are false.
             rows = zip(self.steps, losses, undamaged, strict=True)
@@ -458,6 +495,7 @@ def _loss_curves(
     masks, other_masks = (
         trial.random(stream).keys for stream in (MASKS_AFTER_DAMAGE, MASKS_OF_CONTROL)
     )
+    near: dict[str, tuple[LocalLoss, list[Tensor]]] = {}
     batch = {"undamaged": (undamaged, masks)}
     if control:
         batch[CONTROL] = undamaged, other_masks
@@ -465,11 +503,28 @@ def _loss_curves(
         random = trial.random(StreamId.DAMAGE)
         x, s = damage.apply(grown.x, grown.s, random, trial.task.box)
         batch[name] = undamaged._replace(x=x, s=trial.with_codes_restored(x, s)), masks
+        wound = trial.wound(name, grown.x)
+        if wound is not None:
+            near[name] = LocalLoss(trial.task, grown, wound), []
     worlds, keys = zip(*batch.values(), strict=True)
     random = WorldRandom.from_keys(torch.cat(keys))
-    _, losses = trial.run(combined(torch.cat, worlds), random, steps)
+
+    def watch(now: Particles) -> None:
+        for (loss, values), k in ((each, [*batch].index(name)) for name, each in near.items()):
+            some = slice(k * trial.world_count, (k + 1) * trial.world_count)
+            values.append(loss(Particles(now.x[some], now.s[some])) / loss.bound)
+
+    _, losses = trial.run(combined(torch.cat, worlds), random, steps, watch)
     # Of each entry of the batch a row for each seed.
     rows = trial.by_seed(losses.view(len(steps), len(batch), -1)).permute(1, 2, 0).tolist()
     reference, *others = (tuple(map(tuple, row)) for row in rows)
-    names = list(batch)[1:]
-    return [LossCurve(name, steps, row, reference) for name, row in zip(names, others, strict=True)]
+    curves = []
+    for name, row in zip(list(batch)[1:], others, strict=True):
+        ratios = losses.new_empty(0, len(steps))
+        if name in near:
+            # A world that is not finite has a loss of NaN.
+            lost = losses.new_tensor(row).isnan()
+            ratios = torch.stack(near[name][1], dim=1).masked_fill(lost, math.nan)
+        near_rows = tuple(map(tuple, ratios.tolist()))
+        curves.append(LossCurve(name, steps, row, reference, near_rows))
+    return curves
