@@ -30,7 +30,9 @@ from npa_envs.measure.quality import (
     CLOUD_CHECKPOINTS,
     FIRST_SEED,
     picture_rows,
+    picture_step_count,
     score_line,
+    step_count,
     tables_of,
 )
 from npa_envs.measure.wounds import WoundRow
@@ -66,6 +68,7 @@ WORDS: Mapping[str, str] = {
     "wounds": "places that are damaged, one in each copy of a world",
     "changed": "wounds that raise the loss near them above the bound for healed ones",
     "healed": "of these, wounds near which the loss is within the bound again",
+    "scars": "parts of the body where wounds did not heal",
     "before": "loss before the damage; of wounds, near them",
     "after": "that right after the damage",
     "end": "that at the end",
@@ -112,15 +115,21 @@ def write_report(
     clouds = task.classifies
     checkpoints = (CLOUD_CHECKPOINTS if clouds else CHECKPOINTS)[: None if thorough else 5]
     seeds = range(FIRST_SEED, FIRST_SEED + (8 if thorough else 2))
-    with common.progress_bar(None, show=progress) as advance:
+    changed = task.grows_picture or (thorough and (clouds or task.aligned))
+    tasks = tasks_of_codes(str(path), rule, device)
+    total = FILM_STEPS + step_count(task, checkpoints=checkpoints, changed=changed)
+    if len(tasks) > 1:
+        total += picture_step_count(len(tasks), seed_count=len(seeds))
+    with common.progress_bar(total, show=progress) as advance:
         tables = tables_of(
             rule, task, checkpoints=checkpoints, seeds=seeds, device=device, progress=advance,
-            changed=task.grows_picture or (thorough and (clouds or task.aligned)),
-            texture_metric=task.has_texture_metric,
+            changed=changed, texture_metric=task.has_texture_metric,
         )  # fmt: skip
+        if len(tasks) > 1:
+            tables["pictures"] = picture_rows(
+                rule, tasks, seeds=seeds, device=device, progress=advance
+            )
         missing_films = _write_films(rule, task, path, folder, advance)
-    if len(tasks := tasks_of_codes(str(path), rule, device)) > 1:
-        tables["pictures"] = picture_rows(rule, tasks, seeds=seeds, device=device)
     command = f"npa-envs evaluate {shlex.quote(str(path))} --device {device.type}"
     if not clouds:
         command += f" --seed-count {len(seeds)} --checkpoints {' '.join(map(str, checkpoints))}"
@@ -181,12 +190,12 @@ def shortfalls(tables: Mapping[str, Sequence[Any]]) -> list[str]:
         clauses.append(f"unlike the target: {rows[-1].psnr:.1f} dB at step {rows[-1].step}")
     for row in tables.get("healing", ()):
         if isinstance(row, WoundRow):
-            healed, count, what = row.healed, row.changed, "places keep a scar"
+            healed, count, what = row.healed, row.changed, f"places keep a scar ({row.scars})"
         else:
             healed, count, what = row.worlds_healed, row.world_count, "worlds do not heal"
         if healed < count:
-            rise = f"the loss is {row.end / row.before:.1f} times that before"
-            clauses.append(f"after a {row.damage}, {count - healed} of {count} {what}: {rise}")
+            rise = f"the mean loss becomes {row.end / row.before:.1f} times that before"
+            clauses.append(f"after a {row.damage}, {count - healed} of {count} {what}; {rise}")
     return clauses
 
 

@@ -100,7 +100,7 @@ class WoundRow:
     Of `wounds` wounds `changed` raised the loss near them (`LocalLoss`) above its bound. Of these
     `healed` had it within the bound again at both checks. `before`, `after` and `end` are means of
     that loss over the wounds that changed the picture: before them, right after and at the last
-    check; NaN if there are none.
+    check; NaN if there are none. `scars` names the parts of the body where wounds did not heal.
     """
 
     damage: str
@@ -110,6 +110,7 @@ class WoundRow:
     before: float
     after: float
     end: float
+    scars: str = ""
 
     @property
     def summary(self) -> str:
@@ -146,5 +147,18 @@ def wound_rows(
         losses = loss.before[changed], after[changed], end[changed]
         means = (float(each.mean()) for each in losses)
         name = f"{kind}, {'gap' if kind == 'cut' else 'radius'} {size:g}"
-        rows.append(WoundRow(name, len(centre), count, int(healed.sum()), *means))
+        scars = ", ".join(dict.fromkeys(part_names(worlds.x, centre, changed & ~healed)))
+        rows.append(WoundRow(name, len(centre), count, int(healed.sum()), *means, scars))
     return rows
+
+
+def part_names(x: Tensor, places: Tensor, chosen: Tensor) -> list[str]:
+    """Return the part of the body, such as "top left", of each of the chosen places.
+
+    A part is a ninth of the bounding box of particles `x` [B, N, D], seen with the second axis
+    upwards; `places` have shape [B, D], `chosen` [B].
+    """
+    low, high = x.amin(1), x.amax(1)
+    thirds = (3.0 * (places - low) / (high - low)).long().clamp(0, 2)[chosen]
+    across, up = ("left", "", "right"), ("bottom", "", "top")
+    return [f"{up[row[1]]} {across[row[0]]}".strip() or "middle" for row in thirds.tolist()]

@@ -518,7 +518,8 @@ def test_demo_shows_growth_healing_and_training(tmp_path, monkeypatch, capsys):
     assert len(re.findall(r"PSNR +\d+\.\d+ dB", text)) == 2
     times = r"rises to \d+\.\d times that before, then falls to \d+\.\d times"
     for wound in ("cut through the spots", "wipe of an eye"):
-        assert re.search(rf"a {wound} (heals|heals but for a scar|does not heal) in 4 .*{times}", text)
+        verdict = r"(heals|heals but for a scar|does not heal) in 4 steps"
+        assert re.search(rf"a {wound} {verdict}: .*{times}", text)
     with Image.open(tmp_path / "gecko.gif") as film:
         assert film.size == (512, 512)
         assert film.n_frames == 5 + 2 * (1 + 2)
