@@ -161,8 +161,7 @@ def run_healing(arguments: argparse.Namespace) -> None:
             release_captures()
         line = {"picture": picture, "healing": [asdict(row) for row in rows]}
         append_line(arguments.out / "healing.jsonl", line)
-        healed = [f"{row.damage}: {row.worlds_healed} of {row.world_count}" for row in rows]
-        print(f"{picture}: {', '.join(healed)}", flush=True)
+        print(f"{picture}: {'. '.join(row.summary for row in rows)}", flush=True)
 
 
 def run_long(arguments: argparse.Namespace) -> None:

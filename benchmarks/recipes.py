@@ -7,8 +7,8 @@ JSON, so that a stopped call can continue. `pictures` draws the emoji; `warm-up`
 all kernels and tests that runs side by side learn bit for bit what they learn alone; `merge` makes
 one record, one sheet of pictures and one archive of rules of what several processes left; `report`
 prints the tables and draws the figure; `sync_with` says what the decay of a rule's world is; `long`
-runs finished rules for 100 000 steps within the bounds of `npa-envs stress`; `heal` damages worlds
-of 32 seeds.
+runs finished rules for 100 000 steps within the bounds of `npa-envs stress`; `heal` wounds worlds
+of 8 seeds, each at 32 places on a GPU.
 
     python benchmarks/recipes.py pictures --out PICTURES
     python benchmarks/recipes.py warm-up --device cuda --out OUT
@@ -113,7 +113,7 @@ def measured(trainer: Trainer, size: str, last_step: int = LAST) -> dict[str, An
     worlds: dict[str, Any] = {"seeds": SEEDS, "device": trainer.config.device}
     steps = (4, 8) if size == "tiny" else (*STEPS, LAST)
     steps = tuple(step for step in steps if step <= last_step)
-    grow, heal = (8, 8) if size == "tiny" else (1024, 500)
+    grow, heal = (8, 8) if size == "tiny" else (1024, 1000)
     rows, healed = [], []
     # A rule may diverge; then what came before is kept.
     while steps and not rows:
@@ -326,8 +326,9 @@ def table(runs: Sequence[Mapping[str, Any]], size: str) -> str:
             cells.append(f"{statistics.fmean(losses):.3f}" if losses else "")
         worst = max((_loss(r, n) or 0.0 for r in own for n in steps if n >= 128), default=0.0)
         rows = [row for run in own for row in run["healing"]]
-        count = max(sum(r["world_count"] for r in rows), 1)
-        share = sum(r["worlds_healed"] for r in rows) / count
+        # Older records counted whole worlds.
+        count = max(sum(r.get("changed", r.get("world_count")) for r in rows), 1)
+        share = sum(r.get("healed", r.get("worlds_healed")) for r in rows) / count
         lines.append(f"| {' | '.join([*cells, f'{worst:.3f}', f'{share:.0%}'])} |")
     return "\n".join(lines)
 
@@ -418,9 +419,9 @@ def main() -> None:
         own.add_argument("--device", default="cpu")
         own.add_argument("--preset", default="paper", help="what the world is like")
     long.add_argument("--steps", type=int, default=trained_rule_checks.LONG_RUN_STEPS)
-    heal.add_argument("--count", type=int, default=32, help="seeds")
+    heal.add_argument("--count", type=int, default=8, help="seeds")
     heal.add_argument(
-        "--steps", type=int, nargs=2, default=[1024, 500], help="before and after the damage"
+        "--steps", type=int, nargs=2, default=[1024, 1000], help="before and after the damage"
     )
     own = commands.add_parser("report")
     own.set_defaults(main=report)

@@ -50,7 +50,8 @@ class Wound(NamedTuple):
         """
         away = points - self.centre[:, None]
         if self.normal is None:
-            return torch.linalg.vector_norm(away, dim=-1) - self.size
+            length: Tensor = torch.linalg.vector_norm(away, dim=-1)
+            return length - self.size
         across = self.normal / torch.linalg.vector_norm(self.normal, dim=-1, keepdim=True)
         return (away * across[:, None]).sum(-1).abs() - self.size
 
