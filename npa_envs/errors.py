@@ -36,7 +36,7 @@ class _Brief(reprlib.Repr):
 
 def _sides(value: Any) -> list[int]:
     """Return the lengths of nested lists or tuples of numbers, outermost first; [] for others."""
-    sides = []
+    sides: list[int] = []
     while isinstance(value, list | tuple) and value and len(sides) < 8:
         sides.append(len(value))
         value = value[0]

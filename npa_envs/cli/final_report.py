@@ -61,7 +61,9 @@ TITLES: Mapping[str, str] = {
 WORDS: Mapping[str, str] = {
     "step": "updates since the seed",
     "loss": "distance from the target, 0 if equal; training lowers it",
+    "loss_worst": "that of the worst world",
     "psnr": "likeness of pictures [dB]: 20 is rough, 30 looks alike",
+    "psnr_worst": "that of the worst world",
     "overflow": "how far states leave [-1, 1]; it stays small in a stable world",
     "extent": "longest side of the world [length units]; it grows where particles escape",
     "damage": "what is done to grown worlds: states set to zero in a disk, or a slit",
@@ -75,6 +77,7 @@ WORDS: Mapping[str, str] = {
     "steps_to_heal": "steps until the mean loss is back",
     "worlds_healed": "worlds whose own loss is back",
     "ratio": "mean of the three distances: of patches, of spectra and of colours",
+    "ratio_worst": "that of the worst world",
     "majority": "share of clouds whose majority of particles is right",
     "particle": "share of particles that are right",
     "agreement": "share of particles that agree with their cloud's majority",
@@ -82,12 +85,6 @@ WORDS: Mapping[str, str] = {
     "shuffled": "loss of worlds that have the next picture's code",
 }
 """Columns of a card's tables -> one line that explains them."""
-
-LETTERS = (
-    "N particles, C channels of a state, ε perception radius [length units], α longest move in ε, "
-    "p probability of an update"
-)
-"""The letters of a card's first table."""
 
 GROWN = 200
 """Step of the film's world that is shown beside the target; then it is damaged."""
@@ -163,10 +160,9 @@ def _write_films(
         rule, film_task, seed_world, FILM_STEPS, generator=generator, damages=damages,
         progress=advance,
     )  # fmt: skip
-    target = getattr(film_task, "target_picture", None)
-    if target is not None:
+    if not task.classifies:
         last = max(index for index, step in film.steps.items() if step <= GROWN)
-        frames = [to_uint8(target, film.background), film.frames[last]]
+        frames = [to_uint8(film_task.target_picture, film.background), film.frames[last]]
         captions = ["target", film.captions[last]]
         write_filmstrip(folder / f"{path.stem}-target.png", frames, captions)
     try:
@@ -228,16 +224,16 @@ def _model_card(
         ("machine", f"{facts['machine']}, torch {used['torch']}, warp-lang {used['warp-lang']}"),
         ("date", facts["date"]),
     ]
-    failures = shortfalls(tables)
-    held = "Nothing that was measured fails." if "healing" in tables else "Worlds are stable."
+    failures = [f"- {clause[0].upper()}{clause[1:]}." for clause in shortfalls(tables)]
     parts = [
         f"# {Path(goal).stem}",
         f"A rule of the task `{task_name}` for `{goal}`{others}.",
         pictures,
         markdown_table(("", ""), rows),
-        f"{LETTERS}.",
+        "N: particles, C: channels of a state, ε: radius of perception [length units], α: longest "
+        "move of a step in ε, p: probability of an update.",
         "## What does not hold",
-        "\n".join(f"- {line[0].upper()}{line[1:]}." for line in failures) or held,
+        "\n".join(failures) or "Nothing that was measured fails.",
         "## Training",
         f"Commit {facts['commit']}: {training}",
         "## Measured",
@@ -255,5 +251,5 @@ def _model_card(
         if any(getattr(row, field.name) is not None for row in table)
     )
     words = [f"- {name.replace('_', ' ')}: {WORDS[name]}" for name in names if name in WORDS]
-    parts.append("\n".join((*words, "- worst: of the worst world; other numbers are means")))
+    parts.append("\n".join(words))
     return "\n\n".join(filter(None, parts)) + "\n"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import torch
@@ -149,7 +149,8 @@ def wound_rows(
         means = (float(each.mean()) for each in losses)
         name = f"{kind}, {'gap' if kind == 'cut' else 'radius'} {size:g}"
         scars = ", ".join(dict.fromkeys(part_names(worlds.x, centre, changed & ~healed)))
-        rows.append(WoundRow(name, len(centre), count, int(healed.sum()), *means, scars))
+        row = WoundRow(name, len(centre), count, int(healed.sum()), *means)
+        rows.append(replace(row, scars=scars))
     return rows
 
 
