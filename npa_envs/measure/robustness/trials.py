@@ -520,11 +520,7 @@ def _loss_curves(
     reference, *others = (tuple(map(tuple, row)) for row in rows)
     curves = []
     for name, row in zip(list(batch)[1:], others, strict=True):
-        ratios = losses.new_empty(0, len(steps))
-        if name in near:
-            # A world that is not finite has a loss of NaN.
-            lost = losses.new_tensor(row).isnan()
-            ratios = torch.stack(near[name][1], dim=1).masked_fill(lost, math.nan)
-        near_rows = tuple(map(tuple, ratios.tolist()))
-        curves.append(LossCurve(name, steps, row, reference, near_rows))
+        # A world that is not finite stays as the damage left it.
+        ratios = torch.stack(near[name][1], dim=1).tolist() if name in near else []
+        curves.append(LossCurve(name, steps, row, reference, tuple(map(tuple, ratios))))
     return curves
