@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import torch
@@ -53,7 +53,8 @@ class Wound(NamedTuple):
             length: Tensor = torch.linalg.vector_norm(away, dim=-1)
             return length - self.size
         across = self.normal / torch.linalg.vector_norm(self.normal, dim=-1, keepdim=True)
-        return (away * across[:, None]).sum(-1).abs() - self.size
+        height: Tensor = (away * across[:, None]).sum(-1).abs()
+        return height - self.size
 
 
 class LocalLoss:
@@ -145,12 +146,11 @@ def wound_rows(
             end = loss(later)
             healed = healed & (end <= loss.bound)
         count = int(changed.sum())
-        losses = loss.before[changed], after[changed], end[changed]
-        means = (float(each.mean()) for each in losses)
+        first, then, last = (float(each[changed].mean()) for each in (loss.before, after, end))
         name = f"{kind}, {'gap' if kind == 'cut' else 'radius'} {size:g}"
         scars = ", ".join(dict.fromkeys(part_names(worlds.x, centre, changed & ~healed)))
-        row = WoundRow(name, len(centre), count, int(healed.sum()), *means)
-        rows.append(replace(row, scars=scars))
+        counts = len(centre), count, int(healed.sum())
+        rows.append(WoundRow(name, *counts, first, then, last, scars))
     return rows
 
 
