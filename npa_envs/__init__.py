@@ -8,6 +8,7 @@ from importlib import import_module as _import_module
 from pathlib import Path as _Path
 from typing import TYPE_CHECKING, Any
 
+from npa_envs.errors import suggest as _suggest
 from npa_envs.registration import register_environments as _register_environments
 
 if TYPE_CHECKING:
@@ -78,7 +79,9 @@ __all__ = sorted(_MODULES)
 
 def __getattr__(name: str) -> Any:
     if name not in _MODULES:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        known = {*_MODULES, "agents", "envs", "render", "training", "wrappers"}
+        hint = f"import npa_envs.{name}" if name in known else _suggest(name, known)
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}: {hint}")
     # Kept, so that only the first use searches.
     value = globals()[name] = getattr(_import_module(f"npa_envs.{_MODULES[name]}"), name)
     return value

@@ -89,10 +89,14 @@ def check_world(x: Tensor, s: Tensor) -> None:
                 f"{name} must have shape [B, N, {last}], got {tuple(tensor.shape)}: {hint}"
             )
     if x.shape[2] not in (2, 3):
-        raise NPAError(f"x must have 2 or 3 coordinates, got shape {tuple(x.shape)}")
+        raise NPAError(
+            f"x must have 2 or 3 coordinates, got shape {tuple(x.shape)}: give positions first, "
+            "then states"
+        )
     if x.shape[:2] != s.shape[:2]:
         raise NPAError(
-            f"x and s must agree in worlds and particles, got {tuple(x.shape)} and {tuple(s.shape)}"
+            f"x and s must agree in worlds and particles, got {tuple(x.shape)} and "
+            f"{tuple(s.shape)}: for example s = torch.zeros(*x.shape[:2], channels)"
         )
     if 0 in x.shape or 0 in s.shape:
         raise NPAError(
@@ -223,7 +227,10 @@ def checked_choice(name: str, value: Any, choices: Sequence[Choice]) -> Choice:
         if isinstance(value, type(choice)) and value == choice:
             return choice
     *others, last = map(repr, choices)
-    raise NPAError(f"{name} must be {', '.join(others)} or {last}, got {shown(value)}")
+    text = " ".join(one for one in choices if isinstance(one, str))
+    nearest = suggest(value, text.split()).partition("known: ")[0] if text else ""
+    hint = f": {nearest.strip()}" if nearest else ""
+    raise NPAError(f"{name} must be {', '.join(others)} or {last}, got {shown(value)}{hint}")
 
 
 def checked_number(name: str, value: Any) -> float:
@@ -231,7 +238,7 @@ def checked_number(name: str, value: Any) -> float:
     if not isinstance(value, str | bytes | bool):
         with contextlib.suppress(TypeError, ValueError, RuntimeError, OverflowError):
             return constant(float(value))
-    raise NPAError(f"{name} must be a number, got {shown(value)}")
+    raise NPAError(f"{name} must be a number, got {shown(value)}: try 0.5")
 
 
 def checked_count(name: str, value: Any) -> int:
@@ -241,14 +248,14 @@ def checked_count(name: str, value: Any) -> int:
             count = operator.index(value)
             if count >= 0:
                 return count
-    raise NPAError(f"{name} must be an integer of at least 0, got {shown(value)}")
+    raise NPAError(f"{name} must be an integer of at least 0, got {shown(value)}: try 8")
 
 
 def checked_positive(name: str, value: Any, unit: str = "") -> float:
     """Return a positive, finite number as a float; errors name its `unit`."""
     number = checked_number(name, value)
     if not (math.isfinite(number) and number > 0.0):
-        raise NPAError(f"{name} must be positive and finite{unit}, got {number:g}")
+        raise NPAError(f"{name} must be positive and finite{unit}, got {number:g}: try 0.1")
     return number
 
 
@@ -256,7 +263,7 @@ def checked_finite(name: str, value: Any, unit: str = "") -> float:
     """Return a finite number as a float; errors name its `unit`."""
     number = checked_number(name, value)
     if not math.isfinite(number):
-        raise NPAError(f"{name} must be finite{unit}, got {number:g}")
+        raise NPAError(f"{name} must be finite{unit}, got {number:g}: try 0.1")
     return number
 
 

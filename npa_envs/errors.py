@@ -4,13 +4,46 @@ from __future__ import annotations
 
 import contextlib
 import difflib
+import math
 import reprlib
 from collections.abc import Iterable, Iterator
+from typing import Any
 
 SHOWN_LENGTH = 200
 """Maximum number of characters of a value in an error, about."""
 
-_brief = reprlib.Repr()
+KNOWN_LENGTH = 40
+"""Maximum number of known names in an error."""
+
+SHOWN_NUMBERS = 4
+"""Maximum number of a tensor's or an array's numbers in an error; of larger ones the shape is."""
+
+
+class _Brief(reprlib.Repr):
+    """Python's own short texts, with the shape in place of a tensor's numbers."""
+
+    def repr1(self, x: Any, level: int) -> str:
+        shape = getattr(x, "shape", None)
+        if not isinstance(shape, tuple) or not hasattr(x, "dtype") or isinstance(x, type):
+            sides = _sides(x)
+            many = len(sides) > 1 and math.prod(sides) > SHOWN_NUMBERS
+            return f"{' x '.join(map(str, sides))} numbers" if many else super().repr1(x, level)
+        if math.prod(shape) <= SHOWN_NUMBERS and not getattr(x, "is_meta", False):
+            return " ".join(super().repr1(x, level).split())
+        kind = "array" if type(x).__module__ == "numpy" else type(x).__name__.lower()
+        return f"a {str(x.dtype).removeprefix('torch.')} {kind} of shape {tuple(shape)}"
+
+
+def _sides(value: Any) -> list[int]:
+    """Return the lengths of nested lists or tuples of numbers, outermost first; [] for others."""
+    sides: list[int] = []
+    while isinstance(value, list | tuple) and value and len(sides) < 8:
+        sides.append(len(value))
+        value = value[0]
+    return sides if isinstance(value, int | float) else []
+
+
+_brief = _Brief()
 _brief.maxlevel = 3
 _brief.maxlist = _brief.maxtuple = _brief.maxdict = _brief.maxset = _brief.maxfrozenset = 16
 _brief.maxdeque = _brief.maxarray = 16
@@ -66,8 +99,24 @@ def shown(value: object) -> str:
 
 
 def suggest(name: object, known: Iterable[str]) -> str:
-    """Return the end of an error about an unknown name: the nearest known name, then all."""
+    """Return the end of an error about an unknown name: the nearest known name, then all.
+
+    Of names that are equally near it is the first in the alphabet.
+    """
     names = sorted(known)
-    nearest = difflib.get_close_matches(name, names, n=1) if isinstance(name, str) else []
-    hint = f"did you mean {shown(nearest[0])}? " if nearest else ""
-    return f"{hint}known: {', '.join(names)}"
+    nearest = max(names, key=lambda one: _likeness(name, one), default="")
+    hint = f"did you mean {shown(nearest)}? " if _likeness(name, nearest) >= 0.65 else ""
+    more = f" and {len(names) - KNOWN_LENGTH} more" if len(names) > KNOWN_LENGTH else ""
+    return f"{hint}known: {', '.join(names[:KNOWN_LENGTH])}{more}"
+
+
+def _likeness(name: object, known: str) -> float:
+    """Return how alike two names are by their letters, 1 if they are equal; more by a shared part.
+
+    A part of four letters or more counts by its share of `name`.
+    """
+    if not isinstance(name, str) or not name:
+        return 0.0
+    matcher = difflib.SequenceMatcher(None, known.casefold(), name[:SHOWN_LENGTH].casefold())
+    part = matcher.find_longest_match().size
+    return matcher.ratio() + (0.5 * part / len(name) if part >= 4 else 0.0)

@@ -26,7 +26,7 @@ class Registration:
 
     def __init__(self, name: str, max_episode_steps: int, size: str = "", **keywords: Any) -> None:
         self.id = f"npa/{name}{size}-v0"
-        self.name = name
+        self.name, self.size = name, size
         self.module = f"npa_envs.envs.{re.sub('(?<=[a-z])(?=[A-Z])', '_', name).lower()}"
         self.entry_point = f"{self.module}:{name}Env"
         self.vector_entry_point = f"{self.module}:{name}VectorEnv"

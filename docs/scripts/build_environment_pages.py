@@ -246,7 +246,9 @@ def index() -> str:
         text = sections(environment_class(registration))[""]
         rows.append((f"[`{registration.id}`]({registration.name}.md)", text))
     opening = (
-        "One page each: observation, action, reward, episodes, arguments. Words and letters are "
+        "One page each: observation, action, reward, episodes, arguments. `import npa_envs` "
+        'registers the ids; `gym.make("npa_envs:npa/Texture-v0")` does so by itself. Words and '
+        "letters are "
         "explained in [the glossary](../glossary.md). To train a first policy: "
         "[the tutorial](../tutorial.md). To make one of your own: "
         "[your own task as an environment](../own_environment.md)."

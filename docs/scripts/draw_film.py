@@ -1,4 +1,4 @@
-"""Draw the film at the top of README, `docs/images/gecko.webp`: growth, a cut, erasure, healing.
+"""Draw the film at the top of README, `docs/images/gecko.webp`: growth, a cut, a wiped eye.
 
     python docs/scripts/draw_film.py
 
@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import torch
-from films import FPS, IMAGES, STILL, FilmedWorld, Frame
+from films import IMAGES, STILL, FilmedWorld, Frame
 from torch import Tensor
 
 import npa_envs
@@ -20,10 +20,13 @@ from npa_envs.world.brushes import cut, wipe_state
 
 SEED = 1_000_001
 RESOLUTION = 512
+FPS = 16.0
+EYE = (0.27, 0.69)
+"""The gecko's right eye [length units]."""
 
 # Steps from frame to frame: slow where the eye has much to see.
-GROWTH = [0] * STILL + [1] * 24 + [2] * 20 + [4] * 16 + [16] * 12
-HEALING = [0] * STILL + [1] * 12 + [2] * 14 + [8] * 14
+GROWTH = [0] * STILL + [1] * 68 + [4] * 15 + [16] * 8
+HEALING = [0] * STILL + [1] * 20 + [4] * 16 + [16] * 24
 
 
 def frames() -> Iterator[Frame]:
@@ -50,7 +53,7 @@ def frames() -> Iterator[Frame]:
         world.x, world.s, centre=place(0.0, 0.0), normal=place(0.8, 1.0), gap=0.16
     )
     yield from world.run(HEALING)
-    world.s = wipe_state(world.x, world.s, centre=place(0.3, 0.3), radius=0.22)
+    world.s = wipe_state(world.x, world.s, centre=place(*EYE), radius=0.2)
     yield from world.run(HEALING + [0] * STILL)
 
 

@@ -20,7 +20,7 @@ from npa_envs.world.randomness import StreamId, WorldRandom
 
 
 class MixingTask(SpeciesTask):
-    """The task of mixing species: a particle's loss is 1 minus the entropy of species around it."""
+    """Mix the species; a particle's loss is 1 minus the entropy of species around it."""
 
     def losses(self, population: Population) -> Mapping[str, Tensor]:
         """Return the mean loss of each species' particles, by name, shape [B, S]."""
@@ -71,7 +71,7 @@ class SegregationConfig(SpeciesConfig):
 
 
 class SegregationTask(MixingTask):
-    """The task of separating species: a particle's loss is the entropy of species around it."""
+    """Separate the species; a particle's loss is the entropy of species around it."""
 
     config_type = SegregationConfig
 
@@ -171,7 +171,7 @@ class CoMorphogenesisConfig(PictureLossConfig):
 
 
 class CoMorphogenesisTask(PictureLossTask):
-    """The task of growing a picture from each species, each with its own target."""
+    """Grow a picture from each species, each with its own target."""
 
     config_type = CoMorphogenesisConfig
     least_species = 1

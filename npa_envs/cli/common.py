@@ -5,8 +5,10 @@ from __future__ import annotations
 import argparse
 import contextlib
 import inspect
+import io
 import json
 import math
+import re
 import tempfile
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
@@ -41,14 +43,28 @@ def parse_options(
     `description`, by default the dataclass's docstring.
     """
     kwargs: dict[str, Any] = {} if default is None else {"default": default}
-    options: OptionsT = tyro.cli(
-        cls,
-        prog=f"npa-envs {command}",
-        description=description or inspect.getdoc(cls),
-        args=arguments,
-        config=(tyro.conf.OmitArgPrefixes, tyro.conf.DisallowNone, tyro.conf.SuppressFixed),
-        **kwargs,
-    )
+    kwargs["config"] = tyro.conf.OmitArgPrefixes, tyro.conf.DisallowNone, tyro.conf.SuppressFixed
+    try:
+        options: OptionsT = tyro.cli(
+            cls,
+            prog=f"npa-envs {command}",
+            description=description or inspect.getdoc(cls),
+            args=arguments,
+            **kwargs,
+        )
+    except SystemExit as end:
+        if not end.code:
+            raise
+        # tyro has said what is wrong, but suggests an option only for very similar names.
+        with contextlib.redirect_stdout(io.StringIO()) as text, contextlib.suppress(SystemExit):
+            tyro.cli(cls, args=["--help"], **kwargs)
+        known = set(re.findall("--([a-z][a-z0-9-]*)", text.getvalue()))
+        for word in arguments:
+            name = word.partition("=")[0].removeprefix("--").replace("_", "-")
+            if word.startswith("--") and name not in known:
+                hint = suggest(name, known).partition("known: ")[0].replace("'", "'--", 1)
+                raise NPAError(f"unknown option {word!r}: {hint or 'see --help'}") from end
+        raise
     return options
 
 

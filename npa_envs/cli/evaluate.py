@@ -89,7 +89,8 @@ def _measure_pictures(options: EvaluateOptions, rule: NPARule, **worlds: Any) ->
         )
     tasks = tasks_of_codes(options.rule, rule, worlds["device"], **options.world)
     steps = options.checkpoints or quality.PICTURE_CHECKPOINTS
-    with common.progress_bar(None, show=options.progress) as advance:
+    total = quality.picture_step_count(len(tasks), steps, seed_count=options.seed_count)
+    with common.progress_bar(total, show=options.progress) as advance:
         rows = quality.picture_rows(rule, tasks, checkpoints=steps, progress=advance, **worlds)
     metric = tasks[0].metric_name
     heading = f"{len(tasks)} pictures, {options.seed_count} worlds each, loss: {metric}"
@@ -109,7 +110,7 @@ def _measure_task(options: EvaluateOptions, rule: NPARule, **worlds: Any) -> Res
             "give --target, a built-in name or a picture"
         )
     changed = task.classifies or options.healing
-    total = None if changed else max(options.checkpoints or quality.CHECKPOINTS)
+    total = quality.step_count(task, checkpoints=options.checkpoints, changed=changed)
     with common.progress_bar(total, show=options.progress) as advance:
         tables = quality.tables_of(
             rule, task, checkpoints=options.checkpoints, changed=changed,

@@ -6,6 +6,7 @@ import json
 import math
 import shlex
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import fields
 from datetime import date
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -29,9 +30,14 @@ from npa_envs.measure.quality import (
     CLOUD_CHECKPOINTS,
     FIRST_SEED,
     picture_rows,
+    picture_step_count,
     score_line,
+    step_count,
     tables_of,
 )
+from npa_envs.measure.wounds import WoundRow
+from npa_envs.render.colours import to_uint8
+from npa_envs.render.picture_files import write_filmstrip
 from npa_envs.render.world_film import SCREEN, film_world, write_3d_world
 from npa_envs.rule.files import load_rule
 from npa_envs.tasks.damage import DamageEvent
@@ -51,6 +57,40 @@ TITLES: Mapping[str, str] = {
     "changes": "Some steps after a change of the clouds:",
 }
 """Lines above tables of a model card."""
+
+WORDS: Mapping[str, str] = {
+    "step": "updates since the seed",
+    "loss": "distance from the target, 0 if equal; training lowers it",
+    "loss_worst": "that of the worst world",
+    "psnr": "likeness of pictures [dB]: 20 is rough, 30 looks alike",
+    "psnr_worst": "that of the worst world",
+    "overflow": "how far states leave [-1, 1]; it stays small in a stable world",
+    "extent": "longest side of the world [length units]; it grows where particles escape",
+    "damage": "what is done to grown worlds: states set to zero in a disk, or a slit",
+    "wounds": "places that are damaged, one in each copy of a world",
+    "changed": "wounds that raise the loss near them above the bound for healed ones",
+    "healed": "of these, wounds near which the loss is within the bound again",
+    "scars": "parts of the body where wounds did not heal",
+    "before": "loss before the damage; of wounds, near them",
+    "after": "that right after the damage",
+    "end": "that at the end",
+    "steps_to_heal": "steps until the mean loss is back",
+    "worlds_healed": "worlds whose own loss is back",
+    "ratio": "mean of the three distances: of patches, of spectra and of colours",
+    "ratio_worst": "that of the worst world",
+    "majority": "share of clouds whose majority of particles is right",
+    "particle": "share of particles that are right",
+    "agreement": "share of particles that agree with their cloud's majority",
+    "majority_before": "share of clouds that are still taken for what they were",
+    "shuffled": "loss of worlds that have the next picture's code",
+}
+"""Columns of a card's tables -> one line that explains them."""
+
+GROWN = 200
+"""Step of the film's world that is shown beside the target; then it is damaged."""
+
+LIKENESS = 20.0
+"""PSNR [dB] below which a card says that worlds are unlike the target."""
 
 
 def write_report(
@@ -72,15 +112,21 @@ def write_report(
     clouds = task.classifies
     checkpoints = (CLOUD_CHECKPOINTS if clouds else CHECKPOINTS)[: None if thorough else 5]
     seeds = range(FIRST_SEED, FIRST_SEED + (8 if thorough else 2))
-    with common.progress_bar(None, show=progress) as advance:
+    changed = task.grows_picture or (thorough and (clouds or task.aligned))
+    tasks = tasks_of_codes(str(path), rule, device)
+    total = FILM_STEPS + step_count(task, checkpoints=checkpoints, changed=changed)
+    if len(tasks) > 1:
+        total += picture_step_count(len(tasks), seed_count=len(seeds))
+    with common.progress_bar(total, show=progress) as advance:
         tables = tables_of(
             rule, task, checkpoints=checkpoints, seeds=seeds, device=device, progress=advance,
-            changed=task.grows_picture or (thorough and (clouds or task.aligned)),
-            texture_metric=task.has_texture_metric,
+            changed=changed, texture_metric=task.has_texture_metric,
         )  # fmt: skip
+        if len(tasks) > 1:
+            tables["pictures"] = picture_rows(
+                rule, tasks, seeds=seeds, device=device, progress=advance
+            )
         missing_films = _write_films(rule, task, path, folder, advance)
-    if len(tasks := tasks_of_codes(str(path), rule, device)) > 1:
-        tables["pictures"] = picture_rows(rule, tasks, seeds=seeds, device=device)
     command = f"npa-envs evaluate {shlex.quote(str(path))} --device {device.type}"
     if not clouds:
         command += f" --seed-count {len(seeds)} --checkpoints {' '.join(map(str, checkpoints))}"
@@ -90,10 +136,15 @@ def write_report(
     text = tables_json(tables, **facts)
     write_text(folder / f"{path.stem}.json", text)
     model_card = folder / f"{path.stem}.md"
-    strip = folder / f"{path.stem}-filmstrip.png"
-    picture = f"\n![A world from the seed on.]({strip.name})\n" if strip.exists() else ""
-    write_text(model_card, _model_card(rule, task, task_name, training, facts, tables) + picture)
-    return model_card, score_line(json.loads(text)) + _stability(tables) + missing_films
+    names = {"The target, and a world.": "target", "A world from the seed on.": "filmstrip"}
+    pictures = "\n\n".join(
+        f"![{text}]({path.stem}-{name}.png)"
+        for text, name in names.items()
+        if (folder / f"{path.stem}-{name}.png").exists()
+    )
+    write_text(model_card, _model_card(rule, task, task_name, training, facts, tables, pictures))
+    said = "".join(f"; {clause}" for clause in shortfalls(tables))
+    return model_card, score_line(json.loads(text)) + said + missing_films
 
 
 def _write_films(
@@ -104,11 +155,16 @@ def _write_films(
     generator = torch.Generator(device).manual_seed(FIRST_SEED)
     seed_world = task.seed(1, generator=generator, device=device)
     film_task = task_for_film(task, str(path), rule, device, least=SCREEN)
-    damages = (DamageEvent(200, "cut"), DamageEvent(350, "wipe")) if task.aligned else ()
+    damages = (DamageEvent(GROWN, "cut"), DamageEvent(350, "wipe")) if task.aligned else ()
     grown, film = film_world(
         rule, film_task, seed_world, FILM_STEPS, generator=generator, damages=damages,
         progress=advance,
     )  # fmt: skip
+    if not task.classifies:
+        last = max(index for index, step in film.steps.items() if step <= GROWN)
+        frames = [to_uint8(film_task.target_picture, film.background), film.frames[last]]
+        captions = ["target", film.captions[last]]
+        write_filmstrip(folder / f"{path.stem}-target.png", frames, captions)
     try:
         if task.has_views:
             write_3d_world(task, grown, folder, drawn_by=task)
@@ -118,14 +174,25 @@ def _write_films(
     return ""
 
 
-def _stability(tables: Mapping[str, Sequence[Any]]) -> str:
-    """Return text that says that the last loss is far above the least one, or ""."""
+def shortfalls(tables: Mapping[str, Sequence[Any]]) -> list[str]:
+    """Return what does not hold of a rule with these tables, one clause for each failure."""
+    clauses = []
     rows = tables.get("growth", ())
     least = min(filter(math.isfinite, (row.loss for row in rows)), default=math.nan)
     # Written so that a last loss of NaN also counts as unstable.
     if rows and not rows[-1].loss <= 4.0 * least:
-        return f"; unstable: at step {rows[-1].step} the loss is many times the least"
-    return ""
+        clauses.append(f"unstable: at step {rows[-1].step} the loss is many times the least")
+    elif rows and rows[-1].psnr is not None and not rows[-1].psnr >= LIKENESS:
+        clauses.append(f"unlike the target: {rows[-1].psnr:.1f} dB at step {rows[-1].step}")
+    for row in tables.get("healing", ()):
+        if isinstance(row, WoundRow):
+            healed, count, what = row.healed, row.changed, f"places keep a scar ({row.scars})"
+        else:
+            healed, count, what = row.worlds_healed, row.world_count, "worlds do not heal"
+        if healed < count:
+            rise = f"the mean loss becomes {row.end / row.before:.1f} times that before"
+            clauses.append(f"after a {row.damage}, {count - healed} of {count} {what}; {rise}")
+    return clauses
 
 
 def _model_card(
@@ -135,6 +202,7 @@ def _model_card(
     training: str,
     facts: Mapping[str, str],
     tables: Mapping[str, Sequence[Any]],
+    pictures: str,
 ) -> str:
     config = task.config
     goal = getattr(config, "data", config.goal_text)
@@ -156,10 +224,16 @@ def _model_card(
         ("machine", f"{facts['machine']}, torch {used['torch']}, warp-lang {used['warp-lang']}"),
         ("date", facts["date"]),
     ]
+    failures = [f"- {clause[0].upper()}{clause[1:]}." for clause in shortfalls(tables)]
     parts = [
         f"# {Path(goal).stem}",
         f"A rule of the task `{task_name}` for `{goal}`{others}.",
+        pictures,
         markdown_table(("", ""), rows),
+        "N: particles, C: channels of a state, ε: radius of perception [length units], α: longest "
+        "move of a step in ε, p: probability of an update.",
+        "## What does not hold",
+        "\n".join(failures) or "Nothing that was measured fails.",
         "## Training",
         f"Commit {facts['commit']}: {training}",
         "## Measured",
@@ -170,4 +244,12 @@ def _model_card(
         parts.append(table_markdown(table, missing=UNMEASURED if name == "growth" else "never"))
         if name == "healing":
             parts.append("\n".join(f"- {row.summary}" for row in table))
-    return "\n\n".join(parts) + "\n"
+    names = dict.fromkeys(
+        field.name
+        for table in tables.values()
+        for field in fields(table[0])
+        if any(getattr(row, field.name) is not None for row in table)
+    )
+    words = [f"- {name.replace('_', ' ')}: {WORDS[name]}" for name in names if name in WORDS]
+    parts.append("\n".join(words))
+    return "\n\n".join(filter(None, parts)) + "\n"

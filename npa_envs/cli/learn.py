@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from npa_envs.cli import common
-from npa_envs.errors import NPAError
+from npa_envs.errors import NPAError, shown
 
 if TYPE_CHECKING:
     from npa_envs.agents.learning import CurvePoint
@@ -69,6 +69,9 @@ def main(arguments: Sequence[str]) -> int:
         requested_processes,
     )
 
+    if arguments and "-v" in arguments[0]:
+        env = shown(arguments[0])[1:-1]
+        raise NPAError(f"learn needs a method first, got {env!r}: npa-envs learn ppo {env}")
     with joined_processes() as processes:
         request = None
         if processes.first:

@@ -1,59 +1,131 @@
-"""`npa-envs list`: prints the names of tasks, environments, targets and rules."""
+"""`npa-envs list`: prints the names of presets, targets, environments and rules, with a legend."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import importlib
+import inspect
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Annotated
+
+import tyro
 
 from npa_envs.cli import common
+
+SCORES: Mapping[str, tuple[str, str, str, str]] = {
+    "morphogenesis2d": (
+        "growth", "loss", ".3f", "difference of the drawn picture from the target's, 0 if equal",
+    ),
+    "morphogenesis3d": (
+        "growth", "psnr", ".1f", "PSNR [dB] of views that training never saw, higher is better",
+    ),
+    "texture": (
+        "judge", "ratio", ".2f", "distance from the target, lower is better; 1: the target drawn",
+    ),
+    "point_classification": ("accuracy", "majority", ".1%", "share of digits that are recognised"),
+}  # fmt: skip
+"""Task -> the table, the column and the form of its rules' scores, and what these mean."""
+
+STEPS = (32, 128, 512, 4096)
+"""Steps whose scores are shown, where they were measured."""
 
 
 @dataclass(frozen=True)
 class ListOptions:
-    """List tasks, presets, environments, targets, texture losses, data sets, rules with scores.
+    """List presets of tasks, targets, ids of environments and shipped rules with their scores.
 
     Examples:
       npa-envs list
+      npa-envs list rules
     """
+
+    part: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="PART")] = ""
+    """`rules`, `targets`, `ids` or `presets`; default: all four."""
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Print the names of tasks, environments, targets, losses and rules; return 0."""
-    common.parse_options(ListOptions, "list", arguments)
-    from npa_envs.measure.quality import score_line, scores
-    from npa_envs.registration import ALL, SPECIES, SPECIES_SIZES
-    from npa_envs.rule.files import load_rule, shipped_rules
+    """Print one or all parts of the list; return 0."""
+    options = common.parse_options(ListOptions, "list", arguments)
+    chosen = common.chosen_names("part", [options.part] if options.part else [], PARTS)
+    print("\n\n".join("\n".join(PARTS[part]()) for part in chosen))
+    if not options.part:
+        print(f"\none part: npa-envs list {'|'.join(PARTS)}")
+    return 0
+
+
+def presets() -> Iterator[str]:
+    """Yield a line for each preset of each task."""
+    from npa_envs.training import TASKS
+
+    yield "PRESETS of tasks: npa-envs train TASK --preset PRESET"
+    yield "  iterations × worlds, and about how long they take on one CPU core; `best` and `paper`"
+    yield "  are for a GPU, where `best` takes minutes"
+    for name, entry in TASKS.items():
+        yield f"  {name}: {entry.summary}"
+        for preset, config in entry.presets.items():
+            seconds = entry.expected_seconds(config) or 0.0
+            work = f"{config.total_iterations:>6} × {config.world_count}"
+            yield f"    {preset:<6}{work:<12} {common.duration(seconds)}"
+
+
+def targets() -> Iterator[str]:
+    """Yield a line for each task's targets, for each texture loss, and for the data sets."""
     from npa_envs.tasks.losses.texture import TEXTURE_LOSSES
     from npa_envs.tasks.targets.digit_clouds import BUILT_IN
     from npa_envs.training import TASKS
 
-    print("tasks (npa-envs train TASK --preset PRESET)")
-    for name, entry in TASKS.items():
-        print(f"  {name}: {entry.summary}")
-        for preset, config in entry.presets.items():
-            seconds = entry.expected_seconds(config) or 0.0
-            repeats = "" if config.repeats == 1 else f" ({config.repeats} x {config.iterations})"
-            print(
-                f"    {preset}: {config.total_iterations} iterations{repeats} of "
-                f"{config.world_count} worlds, about {common.duration(seconds)} on one core"
-            )
-    print("environments (import npa_envs; gymnasium.make(NAME) or make_vec(NAME, num_envs=64))")
-    for environment in ALL:
-        print(f"  {environment.id}: episodes of {environment.max_episode_steps} steps")
-    print("several species (npa_envs.envs.multispecies_v0.parallel_env(NAME); needs PettingZoo)")
-    print(f"  {', '.join((*SPECIES, *(size.id for size in SPECIES_SIZES)))}")
-    print("targets (--target NAME, or the path of a picture; for morphogenesis also one emoji)")
+    yield "TARGETS: npa-envs train TASK --target NAME"
+    yield "  or the path of a picture, for morphogenesis2d also one emoji, for 3D a mesh or views"
     for name, entry in TASKS.items():
         if entry.targets():
-            print(f"  {name}: {', '.join(entry.targets())}")
-    print("texture losses (--loss NAME)")
+            yield f"  {name}: {', '.join(entry.targets())}"
+    yield f"  point_classification, by --data: {', '.join(BUILT_IN)}, or a folder of IDX files"
+    yield "  losses of textures, by --loss:"
     for name, loss in TEXTURE_LOSSES.items():
-        print(f"  {name}: {loss.summary}")
-    print("data sets of point clouds (--data NAME, or the path of a folder with MNIST's IDX files)")
-    print(f"  point_classification: {', '.join(BUILT_IN)}")
-    print("rules (npa-envs rollout NAME)")
-    for task_name in TASKS:
-        for name in shipped_rules(task_name):
-            weights = load_rule(name).weight_count
-            print(f"  {name}: {task_name}, {weights} weights; {score_line(scores(name))}")
-    return 0
+        yield f"    {name:<11} {loss.summary}"
+
+
+def ids() -> Iterator[str]:
+    """Yield a line for each environment: its id, the length of an episode, and what is done."""
+    from npa_envs.envs.multi.shipped_tasks import TASKS
+    from npa_envs.registration import ALL, SPECIES, SPECIES_SIZES
+
+    yield "IDS of environments, the steps of an episode, and what is to do"
+    yield "  import npa_envs, then gymnasium.make(ID) or gymnasium.make_vec(ID, num_envs=8)"
+    yield '  without the import: gymnasium.make("npa_envs:npa/Texture-v0")'
+    yield "  Small: few particles, learned in minutes on a laptop; Large: many, for a GPU"
+    order = [entry.name for entry in ALL]
+    for entry in sorted(ALL, key=lambda entry: order.index(entry.name)):
+        module, _, name = entry.entry_point.partition(":")
+        summary = inspect.getdoc(getattr(importlib.import_module(module), name)) or ""
+        same = f"the same, {entry.keywords.get('particle_count')} particles"
+        text = same if entry.size else summary.partition("\n")[0]
+        yield f"  {entry.id:<33} {entry.max_episode_steps:>3}  {text}"
+    yield "  several species: npa_envs.envs.multispecies_v0.parallel_env(ID), with PettingZoo"
+    for environment, task in SPECIES.items():
+        summary = inspect.getdoc(TASKS[task]) or ""
+        steps = TASKS[task].config_type.max_cycles
+        yield f"  {environment:<33} {steps:>3}  {summary.partition(chr(10))[0]}"
+        for size in SPECIES_SIZES:
+            if size.task == task:
+                counts = size.keywords.get("particle_counts") or [size.keywords["particle_count"]]
+                text = f"the same, {' and '.join(map(str, counts))} particles"
+                yield f"  {size.id:<33} {size.max_episode_steps:>3}  {text}"
+
+
+def rules() -> Iterator[str]:
+    """Yield a line for each shipped rule: its size, and its scores after some steps."""
+    from npa_envs.measure.quality import scores
+    from npa_envs.rule.files import load_rule, shipped_rules
+
+    yield "RULES that are shipped: npa-envs view NAME, npa-envs rollout NAME"
+    yield "  their weights, and a score of worlds that training never saw, at steps of their lives"
+    for task, (table, column, form, meaning) in SCORES.items():
+        yield f"  {task}: {meaning}"
+        for name in shipped_rules(task):
+            values = {row["step"]: format(row[column], form) for row in scores(name)[table]}
+            text = ", ".join(f"{values[step]} at {step}" for step in STEPS if step in values)
+            yield f"    {name:<10} {load_rule(name).weight_count:>6} weights  {text}"
+
+
+PARTS = {"rules": rules, "targets": targets, "ids": ids, "presets": presets}

@@ -77,23 +77,24 @@ def main(arguments: Sequence[str]) -> int:
             f"rules must be two or more without itself, got {rules[0].name}: name another one, "
             "or leave out --no-itself"
         )
-    with common.progress_bar(None, show=options.progress) as advance:
-        encounters = Encounters(rules, options, advance)
-        folder = common.writable_folder(options.out)
-        settings = {f.name: getattr(options, f.name) for f in fields(InteractionSettings)}
-        settings["particle_count"] = encounters.particle_count
-        settings["rules"] = {rule.name: rule_digest(rule.rule) for rule in rules}
-        record = InteractionRecord(settings, folder / "interactions.json").read()
-        done = {(row.rule, row.beside) for row in record.rows}
-        missing = [pair for pair in pairs if tuple(rule.name for rule in pair) not in done]
-        if done:
-            print(f"{len(pairs) - len(missing)} of {len(pairs)} pairs were measured before")
+    encounters = Encounters(rules, options)
+    folder = common.writable_folder(options.out)
+    settings = {f.name: getattr(options, f.name) for f in fields(InteractionSettings)}
+    settings["particle_count"] = encounters.particle_count
+    settings["rules"] = {rule.name: rule_digest(rule.rule) for rule in rules}
+    record = InteractionRecord(settings, folder / "interactions.json").read()
+    done = {(row.rule, row.beside) for row in record.rows}
+    missing = [pair for pair in pairs if tuple(rule.name for rule in pair) not in done]
+    if done:
+        print(f"{len(pairs) - len(missing)} of {len(pairs)} pairs were measured before")
+    with common.progress_bar(len(missing), show=options.progress, unit="pair") as advance:
         for first, second in missing:
             rows, frames = encounters.meet(first, second)
             strip = folder / f"{first.name}+{second.name}.png"
             columns = len(frames) // len(rows)
             write_filmstrip(strip, list(frames.values()), list(frames), columns=columns)
             record.add(*rows)
+            advance(1)
 
     print(table_text(record.rows))
     print(f"wrote {record.path} and a filmstrip of each pair")

@@ -269,8 +269,14 @@ def main(arguments: Sequence[str]) -> int:
         print(HELP)
         return 0
     if not arguments or arguments[0].startswith("-"):
-        raise NPAError(f"train needs a task first: {', '.join(TASKS)}")
+        raise NPAError(
+            f"train needs a task first: {', '.join(TASKS)}; npa-envs train TASK --target heart"
+        )
     task_name, *options_given = arguments
+    of_target = [name for name, entry in TASKS.items() if task_name in entry.targets()]
+    if of_target or Path(task_name).is_file():
+        hint = f"npa-envs train {(of_target or ['morphogenesis2d'])[0]} --target {task_name}"
+        raise NPAError(f"train needs a task first, got the target {shown(task_name)}: {hint}")
     task_entry(task_name)
     with joined_processes() as processes:
         request = None

@@ -44,6 +44,9 @@ DIVERGED_FACTOR = 10.0
 HEALED = 1.2
 """A world of a texture has healed once its loss is at most this multiple of that before."""
 
+GROW_STEPS, HEAL_STEPS = 1024, 1000
+"""Default steps of `healing` before the damage, and after it."""
+
 PLACES = {"cuda": 32, "cpu": 6}
 """Default number of places at which `healing` wounds a world, by kind of device."""
 
@@ -154,8 +157,8 @@ def healing(
     rule: NPARule,
     task: Task,
     *,
-    grow_steps: int = 1024,
-    heal_steps: int = 1000,
+    grow_steps: int = GROW_STEPS,
+    heal_steps: int = HEAL_STEPS,
     every: int = 25,
     places: int | None = None,
     seeds: Sequence[int] = tuple(range(8)),
@@ -237,6 +240,9 @@ CLOUD_CHECKPOINTS = (8, 16, 24, 32, 64, 128)
 CUT_FRACTION = 0.25
 """Fraction of its particles that a cut cloud loses."""
 
+SETTLE_STEPS, CHANGED_STEPS = 32, (0, 32, 64, 128)
+"""Default steps of `changes_of_mind` before a change of the clouds, and those measured after it."""
+
 CLOUD_BATCH = 256
 """Maximum number of clouds that run at once."""
 
@@ -313,8 +319,8 @@ def changes_of_mind(
     rule: NPARule,
     task: PointClassification,
     *,
-    settle_steps: int = 32,
-    steps: Sequence[int] = (0, 32, 64, 128),
+    settle_steps: int = SETTLE_STEPS,
+    steps: Sequence[int] = CHANGED_STEPS,
     seed: int = 0,
     progress: Callable[[int], None] | None = None,
 ) -> list[ChangeRow]:
@@ -445,6 +451,18 @@ def tables_of(
     return tables | ({"judge": texture_rows} if texture_rows else {})
 
 
+def step_count(
+    task: Task, *, checkpoints: Sequence[int] | None = None, changed: bool = True
+) -> int:
+    """Return the number of steps that `tables_of` tells `progress` with the same options."""
+    if task.classifies:
+        clouds = len(cast(PointClassification, task).clouds.label)
+        steps = max(checkpoints or CLOUD_CHECKPOINTS)
+        steps += changed * (SETTLE_STEPS + 3 * CHANGED_STEPS[-1])
+        return -(-clouds // CLOUD_BATCH) * steps
+    return max(checkpoints or CHECKPOINTS) + changed * (GROW_STEPS + 2 * HEAL_STEPS)
+
+
 class RuleRunner:
     """Runs worlds by a rule, with a task's rollout options, some of them replaced by `changed`.
 
@@ -569,7 +587,7 @@ def grown(
     Checkpoints are increasing steps. `progress` is called with the steps done since its last call.
     """
     check_steps("checkpoints", checkpoints)
-    task_count = max(1, PICTURE_BATCH // len(seeds))
+    task_count = _tasks_at_once(len(seeds))
     batches: list[list[Particles]] = [[] for _ in checkpoints]
     for begin in range(0, len(tasks), task_count):
         batch_tasks = tasks[begin : begin + task_count]
@@ -587,6 +605,17 @@ def grown(
         combined(torch.cat, batch).map(lambda part: part.view(*shape, *part.shape[1:]))
         for batch in batches
     ]
+
+
+def _tasks_at_once(seed_count: int) -> int:
+    return max(1, PICTURE_BATCH // seed_count)
+
+
+def picture_step_count(
+    task_count: int, checkpoints: Sequence[int] = PICTURE_CHECKPOINTS, *, seed_count: int
+) -> int:
+    """Return the number of steps that `grown` and `picture_rows` tell `progress`."""
+    return -(-task_count // _tasks_at_once(seed_count)) * max(checkpoints)
 
 
 @torch.no_grad()

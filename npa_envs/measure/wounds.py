@@ -53,7 +53,8 @@ class Wound(NamedTuple):
             length: Tensor = torch.linalg.vector_norm(away, dim=-1)
             return length - self.size
         across = self.normal / torch.linalg.vector_norm(self.normal, dim=-1, keepdim=True)
-        return (away * across[:, None]).sum(-1).abs() - self.size
+        height: Tensor = (away * across[:, None]).sum(-1).abs()
+        return height - self.size
 
 
 class LocalLoss:
@@ -101,7 +102,7 @@ class WoundRow:
     Of `wounds` wounds `changed` raised the loss near them (`LocalLoss`) above its bound. Of these
     `healed` had it within the bound again at both checks. `before`, `after` and `end` are means of
     that loss over the wounds that changed the picture: before them, right after and at the last
-    check; NaN if there are none.
+    check; NaN if there are none. `scars` names the parts of the body where wounds did not heal.
     """
 
     damage: str
@@ -111,6 +112,7 @@ class WoundRow:
     before: float
     after: float
     end: float
+    scars: str = ""
 
     @property
     def summary(self) -> str:
@@ -144,8 +146,21 @@ def wound_rows(
             end = loss(later)
             healed = healed & (end <= loss.bound)
         count = int(changed.sum())
-        losses = loss.before[changed], after[changed], end[changed]
-        means = (float(each.mean()) for each in losses)
+        first, then, last = (float(each[changed].mean()) for each in (loss.before, after, end))
         name = f"{kind}, {'gap' if kind == 'cut' else 'radius'} {size:g}"
-        rows.append(WoundRow(name, len(centre), count, int(healed.sum()), *means))
+        scars = ", ".join(dict.fromkeys(part_names(worlds.x, centre, changed & ~healed)))
+        counts = len(centre), count, int(healed.sum())
+        rows.append(WoundRow(name, *counts, first, then, last, scars))
     return rows
+
+
+def part_names(x: Tensor, places: Tensor, chosen: Tensor) -> list[str]:
+    """Return the part of the body, such as "top left", of each of the chosen places.
+
+    A part is a ninth of the bounding box of particles `x` [B, N, D], seen with the second axis
+    upwards; `places` have shape [B, D], `chosen` [B].
+    """
+    low, high = x.amin(1), x.amax(1)
+    thirds = (3.0 * (places - low) / (high - low)).long().clamp(0, 2)[chosen]
+    across, up = ("left", "", "right"), ("bottom", "", "top")
+    return [f"{up[row[1]]} {across[row[0]]}".strip() or "middle" for row in thirds.tolist()]

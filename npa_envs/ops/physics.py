@@ -220,9 +220,11 @@ def make_physics(
     dt = checked_positive("dt", dt)
     position_noise = checked_number("position_noise", position_noise)
     if not 0.0 < update_prob <= 1.0:
-        raise NPAError(f"update_prob must lie in (0, 1], got {update_prob}")
+        raise NPAError(f"update_prob must lie in (0, 1], got {update_prob}: try 0.5")
     if not (math.isfinite(position_noise) and position_noise >= 0.0):
-        raise NPAError(f"position_noise must be finite and not negative, got {position_noise}")
+        raise NPAError(
+            f"position_noise must be finite and not negative, got {position_noise}: try 0.0"
+        )
     sides = checked_box(box, space_dim, radius if boundary == "periodic" else None, dtype)
     return Physics(
         space_dim=space_dim,

@@ -266,7 +266,10 @@ def _locate(source: str | Path) -> tuple[Path, str | None]:
     if path.suffix in _SUFFIXES:
         return path, inner
     if os.path.exists(text):
-        raise NPAError(f"a rule's file must end in {suffixes}, got {shown(text)}: rename it")
+        raise NPAError(
+            f"a rule's file must end in {suffixes}, got {shown(text)}: rename it, or train a rule "
+            "of a picture by npa-envs train morphogenesis2d --target PICTURE"
+        )
     raise NPAError(
         f"unknown rule {shown(text)}: {suggest(text, known)}; or give the path of a "
         f"file that ends in {suffixes}, or a run's folder"

@@ -67,7 +67,7 @@ def parse_damage(text: str) -> DamageEvent:
         raise NPAError(f"damage must be text, got {shown(text)}: for example '300:cut'")
     step, _, damage = text.partition(":")
     kind, *sizes = damage.split(":")
-    if kind:
+    if kind and step.isdecimal():
         check_damage(kind, f" in {shown(text)}")
     if kind and len(sizes) < 2:
         with suppress(ValueError):

@@ -225,7 +225,8 @@ def load_config(
     parse = PARSERS.get(path.suffix.lower())
     if parse is None:
         raise NPAError(
-            f"a configuration file must end in {', '.join(PARSERS)}, got {shown(str(path))}"
+            f"a configuration file must end in {', '.join(PARSERS)}, got {shown(str(path))}: "
+            "write a line such as 'iterations: 500' to run.yaml"
         )
     try:
         fields = parse(text)

@@ -40,7 +40,8 @@ def checked_physics(
     if (x.shape[2], s.shape[2]) != (rule.space_dim, rule.state_dim):
         raise NPAError(
             f"x and s must have the rule's {rule.space_dim} coordinates and {rule.state_dim} "
-            f"channels, got {tuple(x.shape)} and {tuple(s.shape)}"
+            f"channels, got {tuple(x.shape)} and {tuple(s.shape)}: for example "
+            f"s = torch.zeros(*x.shape[:2], {rule.state_dim})"
         )
     weight = rule.hidden.weight
     if weight.dtype != x.dtype or weight.device != x.device:

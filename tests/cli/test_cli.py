@@ -16,11 +16,12 @@ import torch
 from PIL import Image
 
 import npa_envs
+from npa_envs import registration
 from npa_envs.cli import COMMANDS, common, demo, doctor, main
 from npa_envs.cli.train import announcement, parse_run, starting_configuration
 from npa_envs.errors import NPAError
 from npa_envs.render.world_film import WorldFilm
-from npa_envs.rule.files import load_rule, save_rule
+from npa_envs.rule.files import load_rule, save_rule, shipped_rules
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.targets.notes import left_out
 from npa_envs.training import TASKS, preset
@@ -116,10 +117,21 @@ def test_list_names_tasks_presets_targets_and_losses(capsys):
     assert main(["list"]) == 0
     text = capsys.readouterr().out
     words = ["morphogenesis2d", "paper", "fast", "tiny", "gecko", "butterfly", "texture:"]
-    words += ["vgg_ot", "filter_swd", "npa/Regeneration2D-v0", "npa/Mixing-v0, npa/Segregation-v0"]
+    words += ["vgg_ot", "filter_swd", "npa/Regeneration2D-v0", "npa/Mixing-v0"]
     words += ["npa/InvasionLarge-v0", "morphogenesis3d: doughnut, duck, mushroom, rocket"]
     words += ["bubbles, cells, dots, droplets, grid, hearts, maze, stars"]
     assert [word for word in words if word not in text] == []
+    assert max(map(len, text.splitlines())) <= 130
+    parts = {}
+    for part in ("rules", "targets", "ids", "presets"):
+        assert main(["list", part]) == 0
+        parts[part] = capsys.readouterr().out
+    assert "\n".join(parts.values()) == text.rpartition("\none part:")[0]
+    ids = re.findall(r"^  (npa/\S+) +\d+  \S", parts["ids"], re.MULTILINE)
+    named = [entry.id for entry in (*registration.ALL, *registration.SPECIES_SIZES)]
+    assert sorted(ids) == sorted([*named, *registration.SPECIES])
+    for name in shipped_rules():
+        assert len(re.findall(rf"^    {name} +\d+ weights  \d", parts["rules"], re.MULTILINE)) == 1
 
 
 def test_doctor_reports_what_there_is_and_goes_on_where_a_check_breaks(capsys, monkeypatch):
@@ -318,8 +330,14 @@ MISTAKES = [
     ("warmup --space-dims 4", "2, 3 or both"),
     ("warmup --device cuda:99", "device must"),
     ("train", "needs a task first"),
+    ("train gecko", "npa-envs train morphogenesis2d --target gecko"),
+    ("train duck", "npa-envs train morphogenesis3d --target duck"),
+    ("learn npa/Texture-v0", "npa-envs learn ppo npa/Texture-v0"),
+    ("list rule", "unknown part 'rule': did you mean 'rules'?"),
+    ("demo --target hart --out OUT", "did you mean 'heart'?"),
+    ("rollout gecko --damage cut:300", "for example 300:cut"),
     ("train --preset tiny", "needs a task first"),
-    ("train morphogenesis", "unknown task 'morphogenesis': did you mean 'morphogenesis"),
+    ("train morphogenesis", "unknown task 'morphogenesis': did you mean 'morphogenesis2d'"),
     ("train morphogenesis2d --preset papr", "unknown preset 'papr'"),
     ("train morphogenesis2d --preset", "expected one argument"),
     ("train morphogenesis2d --resume --out /nowhere", "no checkpoint to resume from"),
@@ -344,7 +362,8 @@ MISTAKES = [
 ]
 WRONG_OPTIONS = [
     ("train TINY --iterations 0", "iterations must be a whole number"),
-    ("train TINY --iters 3", "--iters"),
+    ("train TINY --iters 3", "unknown option '--iters': did you mean '--iterations'?"),
+    ("train TINY --particles=3", "unknown option '--particles=3': did you mean '--particle-count'"),
     ("rollout gecko --fps 51", "fps must be in [0.1, 50], got 51"),
     ("rollout gecko --background mauvish", "background must be"),
     ("rollout gecko --seed -1", "seed must be in [0, 2^63), got -1"),
@@ -511,12 +530,21 @@ def test_a_message_becomes_one_line_and_an_interruption_has_no_traceback(monkeyp
 
 
 def test_demo_shows_growth_healing_and_training(tmp_path, monkeypatch, capsys):
-    for name in ("GROW_STEPS", "HEAL_STEPS"):
-        monkeypatch.setattr(demo, name, 8)
+    # A world that has hardly begun to grow: a frame for the seed, each step and each wound.
+    monkeypatch.setattr(demo, "GROWING", ((4, 1),))
+    monkeypatch.setattr(demo, "HEALING", ((4, 2),))
     words = ["demo", "--out", str(tmp_path), "--train-seconds", "1", "--no-progress"]
     assert main(words) == 0
     text = capsys.readouterr().out
-    assert len(re.findall(r"PSNR +\d+\.\d+ dB", text)) == 4
+    assert len(re.findall(r"PSNR +\d+\.\d+ dB", text)) == 2
+    times = r"rises to \d+\.\d times that before, then falls to \d+\.\d times"
+    for wound in ("cut through the spots", "wipe of an eye"):
+        verdict = r"(heals|heals but for a scar|does not heal) in 4 steps"
+        assert re.search(rf"a {wound} {verdict}: .*{times}", text)
+    with Image.open(tmp_path / "gecko.gif") as film:
+        assert film.size == (512, 512)
+        # There is no eye yet, so its wipe changes nothing, and equal frames become one.
+        assert film.n_frames == 5 + (1 + 2) + 2
     assert (tmp_path / "report.txt").read_text(encoding="utf-8") in text
     written = {Path(name) for name in re.findall(r"wrote (\S+)", text)}
     assert {path.suffix for path in written} == {".gif", ".mp4", ".png", ".txt", ".safetensors"}

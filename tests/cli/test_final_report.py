@@ -3,7 +3,7 @@
 import json
 import math
 import re
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import pytest
 from PIL import Image
@@ -12,6 +12,8 @@ from support.small_digits import write_idx
 from npa_envs.cli import final_report as report
 from npa_envs.cli import main
 from npa_envs.errors import MissingDependencyError
+from npa_envs.measure.quality import AccuracyRow, EvaluationRow, HealingRow, PictureRow
+from npa_envs.measure.wounds import WoundRow
 from npa_envs.render import world_film
 from npa_envs.training import TASKS
 from npa_envs.training.trainer import JOINT_TASK_NAME
@@ -46,6 +48,7 @@ def test_a_run_of_every_task_ends_with_a_model_card_of_each_rule(task, tmp_path,
     for rule in rules:
         stem = rule.stem
         expected |= {stem + end for end in (".md", ".json", ".gif", ".mp4", "-filmstrip.png")}
+        expected |= set() if task == "point_classification" else {f"{stem}-target.png"}
         card = (run / "report" / f"{stem}.md").read_text("utf-8")
         held = json.loads((run / "report" / f"{stem}.json").read_text("utf-8"))
         assert "npa-envs train" in card
@@ -100,7 +103,7 @@ def test_a_report_without_ffmpeg_has_all_but_the_film_that_needs_it(tmp_path, ca
     said = r"report .*rule\.md: .*; not all films: an MP4 file needs"
     assert re.search(said, capsys.readouterr().out)
     files = {path.name for path in (tmp_path / "run" / "report").iterdir()}
-    assert files == {"rule.md", "rule.json", "rule.gif", "rule-filmstrip.png"}
+    assert files == {"rule.md", "rule.json", "rule.gif", "rule-filmstrip.png", "rule-target.png"}
 
 
 @pytest.mark.parametrize(("factor", "holds"), [(1.0, True), (10.0, False), (math.nan, False)])
@@ -127,3 +130,26 @@ def test_a_rule_that_cannot_be_measured_is_kept_and_said_to_have_no_report(
     assert main([*words, "--learning-rate", "1"]) == 0
     assert "no report   x must be finite" in capsys.readouterr().out
     assert (tmp_path / "run" / "rule.safetensors").exists()
+
+
+def test_a_card_says_in_words_what_does_not_hold():
+    growth = [EvaluationRow(8, 0.1, 0.1, 25.0, 24.0, 0.0, 1.0)]
+    assert report.shortfalls({"growth": growth}) == []
+    rough = [replace(growth[0], step=16, psnr=15.0)]
+    assert report.shortfalls({"growth": rough}) == ["unlike the target: 15.0 dB at step 16"]
+    wound = WoundRow("wipe, radius 0.2", 6, 5, 3, 0.1, 1.0, 0.3, scars="top left, bottom")
+    whole = HealingRow("cut, gap 0.1", 0.1, 0.5, None, 6, 8, 0.2)
+    assert report.shortfalls({"growth": growth, "healing": [wound, whole]}) == [
+        "after a wipe, radius 0.2, 2 of 5 places keep a scar (top left, bottom); the mean loss "
+        "becomes 3.0 times that before",
+        "after a cut, gap 0.1, 2 of 8 worlds do not heal; the mean loss becomes 2.0 times that "
+        "before",
+    ]
+    healed = replace(wound, healed=5)
+    assert report.shortfalls({"growth": growth, "healing": [healed]}) == []
+
+
+def test_a_card_explains_each_column_of_its_tables():
+    rows = {EvaluationRow, HealingRow, WoundRow, AccuracyRow, PictureRow}
+    names = {field.name for row in rows for field in fields(row)}
+    assert names - report.WORDS.keys() == {"world_count", "target"}

@@ -8,13 +8,13 @@ import torch
 
 import npa_envs.measure.quality
 from npa_envs.errors import NPAError
-from npa_envs.measure.quality import healing
-from npa_envs.measure.wounds import LocalLoss, Wound
+from npa_envs.measure.quality import healing, step_count, tables_of
+from npa_envs.measure.wounds import LocalLoss, Wound, part_names
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2D
 from npa_envs.tasks.morphogenesis3d import Morphogenesis3D
 from npa_envs.tasks.seeds import spread_points
-from npa_envs.training import preset
+from npa_envs.training import TASKS, preset
 from npa_envs.world.particles import Particles
 
 COUNT = 512
@@ -189,3 +189,27 @@ def test_in_3d_the_pixels_are_those_that_show_the_wound():
     errors = task.pixel_errors(*world[:2])
     assert errors.shape == (1, 4, 32, 32)
     assert float(errors.mean()) == pytest.approx(float(task.metric(*world[:2])), rel=1e-4)
+
+
+def test_parts_of_a_body_are_named_as_they_are_seen():
+    at = torch.tensor([0.0, 0.5, 1.0])
+    places = torch.stack(torch.meshgrid(at, at, indexing="xy"), dim=-1).flatten(0, 1)
+    x = 3.0 * torch.tensor([[0.0, 0.0], [1.0, 1.0]]).expand(9, -1, -1)
+    names = part_names(x, 3.0 * places, torch.ones(9, dtype=torch.bool))
+    assert names == [
+        "bottom left", "bottom", "bottom right", "left", "middle", "right", "top left", "top",
+        "top right",
+    ]  # fmt: skip
+    assert part_names(x, 3.0 * places, torch.arange(9) == 6) == ["top left"]
+
+
+@pytest.mark.parametrize("changed", [False, True])
+def test_progress_bars_know_how_many_steps_a_measurement_takes(changed, task, monkeypatch):
+    monkeypatch.setattr(npa_envs.measure.quality, "rollout_particles", lambda _, now, *a, **k: now)
+    digits = preset("tiny", "point_classification", particle_count=16).task
+    for one in (task, TASKS["point_classification"].make(digits, torch.device("cpu"))):
+        rule = one.make_rule(torch.Generator().manual_seed(0))
+        done: list[int] = []
+        steps = {"checkpoints": (4, 8), "changed": changed}
+        tables_of(rule, one, **steps, seeds=(0,), progress=done.append)
+        assert sum(done) == step_count(one, **steps)
