@@ -193,29 +193,31 @@ def _points(file: MeshFile, vertex: Element) -> Splats:
 
 def _fitted(file: MeshFile, what: str, columns: tuple[FloatArray, ...], summary: str) -> Splats:
     """Return Gaussians (the fields of `Splats`) scaled into the ball, without strays."""
-    means, scales, _, opacities, _ = columns
-    finite = np.ones(len(means), dtype=bool)
+    positions, sizes, _, shares, _ = columns
+    finite = np.ones(len(positions), dtype=bool)
     for values in columns:
-        finite &= np.isfinite(values.reshape(len(means), -1)).all(axis=1)
-    seen = finite & (opacities >= VISIBLE_OPACITY)
+        finite &= np.isfinite(values.reshape(len(positions), -1)).all(axis=1)
+    seen = finite & (shares >= VISIBLE_OPACITY)
     if seen.sum() < 2:
         raise file.error(
             f"must hold {what} of an opacity of at least {VISIBLE_OPACITY}, got {seen.sum()}"
         )
-    away = np.linalg.norm(means - np.median(means[seen], axis=0), axis=1)
+    away = np.linalg.norm(positions - np.median(positions[seen], axis=0), axis=1)
     near = finite & (away <= STRAY * np.quantile(away[seen], 0.98))
     if not near.all():
         file.left_out(
             f"{int((~near).sum())} of {len(near)} {what}, far from the others or infinite"
         )
-    low, high = (f(means[seen & near], axis=0) for f in (np.min, np.max))
+    low, high = (f(positions[seen & near], axis=0) for f in (np.min, np.max))
     middle = 0.5 * (low + high)
-    size = np.linalg.norm(means[seen & near] - middle, axis=1).max()
+    size = np.linalg.norm(positions[seen & near] - middle, axis=1).max()
     if not size > 0.0:
         raise file.error(f"must hold {what} at several places, got all at one")
-    columns = ((means - middle) * (RADIUS / size), scales * (RADIUS / size), *columns[2:])
-    tensors = [torch.from_numpy(np.ascontiguousarray(each[near])).float() for each in columns]
-    return Splats(*tensors, summary)
+    columns = ((positions - middle) * (RADIUS / size), sizes * (RADIUS / size), *columns[2:])
+    means, scales, turns, opacities, harmonics = (
+        torch.from_numpy(np.ascontiguousarray(each[near])).float() for each in columns
+    )
+    return Splats(means, scales, turns, opacities, harmonics, summary)
 
 
 def draw_splats(splats: Splats, cameras: Cameras) -> Tensor:

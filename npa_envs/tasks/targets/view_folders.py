@@ -316,7 +316,7 @@ def _plain_background(folder: Path, frames: Sequence[Frame]) -> FloatImage | Non
         raise NPAError(
             f"views must have a transparent background, or a plain one to cut out, but no picture "
             f"of {shown(str(folder))} has transparency, and only {share:.0%} of the pixels at "
-            "their edges have one colour: remove the background, and save PNGs with alpha"
+            "their edges have one colour: remove the background, and save PNG files"
         )
     return background
 
