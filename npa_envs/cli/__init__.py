@@ -100,8 +100,7 @@ def _printed_targets() -> Iterator[None]:
     printed: set[str] = set()
 
     def show(record: logging.LogRecord) -> bool:
-        line = record.getMessage()
-        if line not in printed:
+        if (line := record.getMessage()) not in printed:
             printed.add(line)
             stream = sys.stderr if record.levelno > logging.INFO else sys.stdout
             print(line, file=stream, flush=True)
@@ -109,14 +108,13 @@ def _printed_targets() -> Iterator[None]:
 
     logger, handler = logging.getLogger("npa_envs.targets"), logging.Handler()
     handler.addFilter(show)
-    before = logger.level
     logger.addHandler(handler)
     logger.setLevel(logging.INFO)
     try:
         yield
     finally:
         logger.removeHandler(handler)
-        logger.setLevel(before)
+        logger.setLevel(logging.NOTSET)
 
 
 def _dispatch(arguments: Sequence[str]) -> int:

@@ -13,17 +13,8 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 EXTRAS = (
-    "envs",
-    "sb3",
-    "human",
-    "view",
-    "bench",
-    "evolution",
-    "points",
-    "meshes",
-    "heic",
-    "minari",
-)
+    "envs", "sb3", "human", "view", "bench", "evolution", "points", "meshes", "heic", "minari",
+)  # fmt: skip
 """The extras of `all`."""
 
 

@@ -20,7 +20,7 @@ from npa_envs.tasks.targets.picture_points import builtin_targets
 from npa_envs.world.particles import Particles
 from npa_envs.world.randomness import Randomness
 
-PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp")
+PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".avif", ".heic", ".gif", ".tif", ".tiff")
 """Suffixes of the files in a folder that are targets."""
 
 

@@ -26,6 +26,7 @@ from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.base import GrowthConfig, GrowthTask, contributions_to_loss
 from npa_envs.tasks.gaussian_outputs import OUTPUTS, Gaussians, appearance
 from npa_envs.tasks.losses.ms_ssim import MultiScaleSimilarity
+from npa_envs.tasks.targets.notes import tell
 from npa_envs.tasks.targets.views import (
     Views,
     ViewTarget,
@@ -161,6 +162,7 @@ class Morphogenesis3D(GrowthTask[Morphogenesis3DConfig]):
                 training_count=config.training_views,
                 held_out_count=config.held_out_views,
             )
+            tell(target.summary)
         for views in (target.training, target.held_out):
             if views.pictures.shape[1:] != (side, side, 4):
                 raise NPAError(

@@ -112,11 +112,7 @@ class _Gltf:
         if not uri.startswith("data:"):
             return self.file.neighbour(unquote(uri))
         head, _, body = uri.partition(",")
-        try:
-            coded = head.endswith(";base64")
-            return base64.b64decode(body + "==") if coded else unquote_to_bytes(body)
-        except ValueError as error:
-            raise self.file.error(f"has damaged data in a URI ({error}): save it again") from error
+        return base64.b64decode(body + "==") if head.endswith(";base64") else unquote_to_bytes(body)
 
     def _view(self, index: Any) -> memoryview:
         """Return the bytes of a buffer view."""
@@ -170,9 +166,10 @@ class _Gltf:
     def _values(self, index: Any, rows: Any = slice(None)) -> FloatArray:
         """Return rows of an accessor, normalised if it says so, [any, components]."""
         raw = self._raw(index)[rows]
+        values: FloatArray = raw.astype(np.float64)
         if self._item("accessors", index).get("normalized") and raw.dtype.kind in "iu":
-            return np.maximum(raw / np.iinfo(raw.dtype).max, -1.0)
-        return raw.astype(np.float64)
+            values = np.maximum(values / np.iinfo(raw.dtype).max, -1.0)
+        return values
 
     # The scene.
 

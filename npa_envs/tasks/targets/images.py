@@ -14,7 +14,7 @@ from PIL import Image, UnidentifiedImageError, features
 
 from npa_envs.atomic_files import read_bytes
 from npa_envs.errors import MissingDependencyError, NPAError, importing, shown
-from npa_envs.tasks.targets.picture_modes import Mask, kind_of_tiff, to_rgba
+from npa_envs.tasks.targets.picture_modes import Mask, correct_tiles, kind_of_tiff, to_rgba
 
 OPAQUE = 128
 """Minimum alpha of a pixel that belongs to a target, out of 255."""
@@ -102,6 +102,7 @@ def decode_image(content: bytes, *, label: str) -> Image.Image:
             warnings.simplefilter("ignore")
             with Image.open(io.BytesIO(content), formats=_formats(content, name)) as opened:
                 _check_area(opened.size, name)
+                correct_tiles(opened)
                 opened.load()
                 # A format inside of another may have another size.
                 _check_area(opened.size, name)
@@ -109,10 +110,9 @@ def decode_image(content: bytes, *, label: str) -> Image.Image:
     except Image.DecompressionBombError as error:
         raise _too_large(name, "more") from error
     except UnidentifiedImageError as error:
-        kind = kind_of_tiff(content)
-        if kind:
+        if kind := kind_of_tiff(content):
             raise NPAError(
-                f"target {name} is a {kind}, which Pillow does not read: save it as PNG"
+                f"target {name} is a {kind}, which Pillow does not read, or damaged: save it as PNG"
             ) from error
         raise NPAError(
             f"target {name} must be a picture ({', '.join(FORMATS)}, AVIF, HEIC), "
@@ -123,8 +123,8 @@ def decode_image(content: bytes, *, label: str) -> Image.Image:
     except Exception as error:
         # Pillow's decoders report damaged data by exceptions of many kinds.
         raise NPAError(
-            f"target {name} cannot be decoded, it is truncated or damaged ({shown(error)}): "
-            "save the picture again, as PNG"
+            f"target {name} cannot be decoded, it is truncated or damaged, or of a kind that "
+            f"Pillow does not read ({shown(error)}): save the picture again, as PNG"
         ) from error
 
 
@@ -143,6 +143,8 @@ def _formats(content: bytes, name: str) -> tuple[str, ...]:
                 "pip install --upgrade pillow, or save it as PNG"
             )
         return (*FORMATS, "AVIF")
+    if not any(brand in brands for brand in (b"hei", b"hev", b"mif1", b"msf1")):
+        return FORMATS
     hint = "pip install pillow-heif, or save it as PNG"
     with importing("pillow-heif", f"target {name}, a HEIC picture,", hint):
         import pillow_heif

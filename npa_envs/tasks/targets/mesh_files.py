@@ -88,7 +88,7 @@ def _joined(file: MeshFile, parts: list[Part]) -> Mesh:
         which = "the file has none" if plain.all() else f"{plain.sum()} triangles have none"
         shade = "white" if file.plain == 1.0 else "grey"
         file.left_out(f"colours, as {which}: {'all is' if plain.all() else 'they are'} {shade}")
-    looks = [f"{total} triangles"]
+    looks = [f"{total} triangle" + "s" * (total > 1)]
     if number:
         size = "texture {1} x {0}".format(*textures[0].pixels.shape)
         looks.append(size if len(number) == 1 else f"{len(number)} textures")
@@ -96,7 +96,7 @@ def _joined(file: MeshFile, parts: list[Part]) -> Mesh:
         looks.append(f"{len(file.materials)} material" + "s" * (len(file.materials) > 1))
     elif not number:
         looks.append("no colours" if plain.all() else "colours of corners or faces")
-    summary = f"{file.path.name}: {', '.join(looks)}"
+    summary = f"{shown(file.path.name)[1:-1]}: {', '.join(looks)}"
     mesh = Mesh(vertices, faces, colours.clip(0.0, 1.0), summary=summary)
     if number:
         uv = np.nan_to_num(uv).clip(-_MAX_UV, _MAX_UV)
@@ -182,40 +182,37 @@ def _read_rows(
     def stored(kind: str) -> np.dtype[Any]:
         return np.dtype(np.float64 if order == "=" else order + _PLY_TYPES[kind])
 
-    declared = {key: _PLY_TYPES[kind] for key, _, kind in properties}
-    if not any(counted for _, counted, _ in properties):
-        fields = [(key, stored(kind)) for key, _, kind in properties]
-        rows = np.frombuffer(data, fields, count, start) if count else np.empty(0, fields)
-        ones = np.ones(count, dtype=np.int64)
-        return {
-            k: PlyProperty(rows[k].astype(declared[k]), ones) for k in declared
-        }, start + rows.nbytes
-    plan = [
-        (
-            struct.Struct(order + stored(counted).char.replace("l", "q")) if counted else None,
-            stored(kind),
-        )
-        for _, counted, kind in properties
+    keys, kinds = [key for key, _, _ in properties], [stored(kind) for _, _, kind in properties]
+    counters = [
+        struct.Struct(order + stored(c).char.replace("l", "q")) if c else None
+        for _, c, _ in properties
     ]
-    pieces: list[list[bytes]] = [[] for _ in plan]
-    counts: list[list[int]] = [[] for _ in plan]
-    for _ in range(count):
-        for k, (counter, kind_stored) in enumerate(plan):
-            length = 1
-            if counter is not None:
-                length = int(counter.unpack_from(data, start)[0])
-                start += counter.size
-            end = start + length * kind_stored.itemsize
-            if not start <= end <= len(data):
-                raise ValueError("it ends too early")
-            counts[k].append(length)
-            pieces[k].append(data[start:end])
-            start = end
-    found = {}
-    for k, (key, _, kind) in enumerate(properties):
-        values = np.frombuffer(b"".join(pieces[k]), stored(kind))
-        found[key] = PlyProperty(values.astype(declared[key]), np.array(counts[k], dtype=np.int64))
-    return found, start
+    if not any(counters):
+        fields = list(zip(keys, kinds, strict=True))
+        rows = np.frombuffer(data, fields, count, start) if count else np.empty(0, fields)
+        columns, end = [rows[key] for key in keys], start + rows.nbytes
+        counts = [np.ones(count, dtype=np.int64) for _ in keys]
+    else:
+        pieces: list[list[bytes]] = [[] for _ in keys]
+        lengths: list[list[int]] = [[] for _ in keys]
+        plan, end = list(zip(counters, kinds, pieces, lengths, strict=True)), start
+        for _ in range(count):
+            for counter, kind, found, sizes in plan:
+                length = 1
+                if counter is not None:
+                    length = int(counter.unpack_from(data, end)[0])
+                    end += counter.size
+                start, end = end, end + length * kind.itemsize
+                if not start <= end <= len(data):
+                    raise ValueError("it ends too early")
+                sizes.append(length)
+                found.append(data[start:end])
+        columns = [np.frombuffer(b"".join(p), kind) for p, kind in zip(pieces, kinds, strict=True)]
+        counts = [np.array(each, dtype=np.int64) for each in lengths]
+    return {
+        key: PlyProperty(values.astype(_PLY_TYPES[kind]), each)
+        for (key, _, kind), values, each in zip(properties, columns, counts, strict=True)
+    }, end
 
 
 def ply_colours(file: MeshFile, element: dict[str, PlyProperty]) -> FloatArray | None:
@@ -260,6 +257,8 @@ def _read_ply_parts(file: MeshFile, content: bytes) -> list[Part]:
             texture = file.texture(name, read, ("repeat", "repeat"))
         part = Part(vertices, faces[chosen], None if colours is None else colours[chosen])
         if texture is not None and uv is not None:
+            if colours is not None:
+                file.left_out("colours where there is a texture")
             # In this format v goes up.
             flipped = uv[chosen] * (1.0, -1.0) + (0.0, 1.0)
             part = Part(vertices, faces[chosen], None, flipped, texture.texture)
@@ -298,17 +297,13 @@ def _read_off(file: MeshFile, content: bytes) -> list[Part]:
     # Files that call themselves OFF have colours after x, y, z and a normal, too.
     start = 6 if head is not None and head[2] else 3
     least = start + (5 if head is not None and head[1] else 3)
-    colours = None
+    rows, of_corners = [row[int(row[0]) + 1 :] for row in faces], False
     if corners and all(len(row) >= least for row in corners):
-        shades = unit_colours(
-            np.array([row[start : start + 3] for row in corners], dtype=np.float64)
-        )
-        colours = shades[flat[places]]
-    elif any(len(row) > int(row[0]) + 3 for row in faces):
-        shades = np.array(
-            [(row[int(row[0]) + 1 :] + ["nan"] * 3)[:3] for row in faces], dtype=np.float64
-        )
-        colours = np.repeat(unit_colours(shades)[owners][:, None], 3, axis=1)
+        rows, of_corners = [row[start:] for row in corners], True
+    shades = np.array([(row + ["nan"] * 3)[:3] for row in rows], dtype=np.float64).reshape(-1, 3)
+    # Negative ones are normals.
+    shades = unit_colours(np.where((shades < 0).any(), np.nan, shades))
+    colours = shades[flat[places]] if of_corners else np.repeat(shades[owners][:, None], 3, axis=1)
     return [Part(vertices, flat[places], colours)]
 
 
@@ -317,11 +312,8 @@ def _read_off(file: MeshFile, content: bytes) -> list[Part]:
 
 def _read_stl(file: MeshFile, content: bytes) -> list[Part]:
     """Return the parts of an STL file, one for each solid, with colours of triangles."""
-    with importing(
-        "trimesh",
-        f"reading the mesh {shown(str(file.path))}",
-        "pip install 'npa-envs[meshes]', or save it as PLY or GLB",
-    ):
+    cure = "pip install 'npa-envs[meshes]', or save it as PLY or GLB"
+    with importing("trimesh", f"reading the mesh {shown(str(file.path))}", cure):
         from trimesh.exchange.stl import load_stl
     read = load_stl(io.BytesIO(content))
     parts = []

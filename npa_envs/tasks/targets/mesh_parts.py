@@ -22,8 +22,8 @@ MAX_TRIANGLES = 2**23
 """Maximum number of triangles of a mesh."""
 
 _MAX_TEXELS = 2**27
-_MAX_WORK = 2**31
-_MAX_SEARCHES = 32
+_MAX_WORK = 2**28
+_MAX_SEARCHES = 4
 _VECTORISED = 40  # corners
 
 
@@ -160,7 +160,8 @@ def unit_colours(values: NDArray[np.generic]) -> FloatArray:
     top = float(np.nan_to_num(values.astype(np.float64)).max(initial=0.0))
     whole = values.dtype.kind in "iu"
     scale = 65535.0 if top > 255.0 else 255.0 if whole or top > 2.0 else 1.0
-    return (values.astype(np.float64) / scale).clip(0.0, 1.0)
+    colours: FloatArray = (values.astype(np.float64) / scale).clip(0.0, 1.0)
+    return colours
 
 
 def triangulated(points: FloatArray, counts: IntArray) -> tuple[IntArray, IntArray]:
@@ -215,8 +216,9 @@ def _flattened(points: FloatArray) -> FloatArray:
     around = points - points[0]
     normal = np.cross(around, np.roll(around, -1, axis=0)).sum(axis=0)
     axis = int(np.abs(normal).argmax())
-    flat = around[:, [(axis + 1) % 3, (axis + 2) % 3]]
-    return flat if normal[axis] >= 0 else flat * (-1.0, 1.0)
+    flat: FloatArray = around[:, [(axis + 1) % 3, (axis + 2) % 3]]
+    flat[:, 0] *= 1.0 if normal[axis] >= 0 else -1.0
+    return flat
 
 
 def _is_convex(flat: FloatArray) -> bool:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import functools
 import logging
 
+from npa_envs.errors import shown
+
 logger = logging.getLogger("npa_envs.targets")
 
 
@@ -21,4 +23,5 @@ def left_out(name: str, text: str, *, what: str = "left out") -> None:
     `name` is the file's name or path. `text` says what was left out, as in "its normals"; `what` is
     the word before it.
     """
-    logger.warning("%s: %s: %s", name, what, text)
+    # As in Python's own text, without letters that no terminal prints.
+    logger.warning("%s: %s: %s", shown(name)[1:-1], what, text)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,19 +23,11 @@ DARK = 0.25
 _CLIPPED = 1.0 + 0.5 / 255.0
 _SRGB_GAMMA = 1.0 / 2.2
 _MODES_OF_PROFILES = {"RGB": "RGB", "GRAY": "L", "CMYK": "CMYK", "Lab": "LAB"}
-_BITS, _PHOTOMETRIC, _SAMPLE_FORMAT, _SUBFILES = 258, 262, 339, 330  # tags of TIFF
+_BITS, _PHOTOMETRIC, _PLANES, _SUBFILES, _SAMPLE_FORMAT = 258, 262, 284, 330, 339  # tags of TIFF
+_COLOURS = 320
+_SEPARATE = 2  # of _PLANES
 _SIGNED, _FLOAT = 2, 3  # of _SAMPLE_FORMAT
-
-
-class _Scale(NamedTuple):
-    """What the samples of a grey picture mean."""
-
-    white: float
-    """The sample that is white, unless `inverted`; 0 is the other end."""
-    inverted: bool
-    """Whether 0 is white."""
-    kind: int
-    """1: unsigned integers; `_SIGNED`, `_FLOAT`."""
+_NATIVE_MODES = {"F;32BF": "F;32NF", "I;32BS": "I;32NS", "I;16BS": "I;16NS"}
 
 
 def to_rgba(opened: ImageFile.ImageFile, content: bytes, name: str) -> Image.Image:
@@ -45,15 +37,19 @@ def to_rgba(opened: ImageFile.ImageFile, content: bytes, name: str) -> Image.Ima
     transparent becomes so, and so does NaN. An embedded colour profile is applied. What is not
     used is told by `left_out`, which calls the file `name`.
     """
-    scale = _scale_of(opened)
-    more = getattr(opened, "is_animated", False)
-    if more or (opened.format == "TIFF" and _SUBFILES in _tags(opened)):
+    white, inverted, kind = _scale_of(opened)
+    tags: Any = getattr(opened, "tag_v2", {})
+    if getattr(opened, "is_animated", False) or _SUBFILES in tags:
         left_out(name, "all its frames, pages or pictures but the first")
     is_png = opened.format == "PNG"
     image = ImageOps.exif_transpose(opened)
+    palette = tags.get(_COLOURS, ()) if image.mode == "P" else ()
+    if 0 < max(palette, default=0) < 256:
+        # Some programs write colours of 8 bits, of which Pillow takes the upper half of 16.
+        image.putpalette(np.array(palette, np.uint8).reshape(3, -1).T.tobytes())
     there = _not_transparent(image, content) if is_png else None
-    if image.mode.startswith("I") or image.mode == "F" or scale.kind == _SIGNED:
-        image, numbers = _to_eight_bits(image, scale, name)
+    if image.mode.startswith("I") or image.mode == "F" or kind == _SIGNED:
+        image, numbers = _to_eight_bits(image, white, inverted, kind, name)
         there = numbers if there is None else there & numbers
     if image.mode == "La":
         image = image.convert("LA")
@@ -74,6 +70,23 @@ def to_rgba(opened: ImageFile.ImageFile, content: bytes, name: str) -> Image.Ima
     return rgba
 
 
+def correct_tiles(opened: ImageFile.ImageFile) -> None:
+    """Correct, before a TIFF is loaded, how Pillow unpacks samples of more than 8 bits.
+
+    It swaps the bytes of big-endian ones that libtiff has swapped before, and takes planes of 16
+    bits, where they are not compressed, for planes of 8.
+    """
+    tags: Any = getattr(opened, "tag_v2", {})
+    planes = tags.get(_PLANES) == _SEPARATE and max(tags.get(_BITS, (1,))) == 16
+    for k, tile in enumerate(opened.tile if tags else ()):
+        mode, *others = tile.args
+        if tile.codec_name == "libtiff":
+            mode = _NATIVE_MODES.get(mode, mode)
+        elif planes and len(mode) == 1:
+            mode += ";16B" if tags.prefix == b"MM" else ";16L"
+        opened.tile[k] = tile._replace(args=(mode, *others))
+
+
 def kind_of_tiff(content: bytes) -> str:
     """Return what the samples of a TIFF file are, for an error; "" for another file."""
     if not content.startswith(tuple(TiffImagePlugin.PREFIXES)):
@@ -90,36 +103,38 @@ def kind_of_tiff(content: bytes) -> str:
     return "TIFF of bits {}, sample format {}, photometric {}".format(*map(shown, numbers))
 
 
-def _tags(opened: ImageFile.ImageFile) -> Any:
-    return getattr(opened, "tag_v2", {})
+def _scale_of(opened: ImageFile.ImageFile) -> tuple[float, bool, int]:
+    """Return a grey picture's sample that is white, whether 0 is so instead, and a sample format.
 
-
-def _scale_of(opened: ImageFile.ImageFile) -> _Scale:
+    The format is 1 for unsigned integers, else `_SIGNED` or `_FLOAT`.
+    """
     if opened.format != "TIFF":
         # Pillow scales the samples of PGM files to 16 bits.
-        return _Scale(1.0, False, _FLOAT) if opened.mode == "F" else _Scale(65535.0, False, 1)
-    tags = _tags(opened)
+        return (1.0, False, _FLOAT) if opened.mode == "F" else (65535.0, False, 1)
+    tags: Any = getattr(opened, "tag_v2", {})
     kind, bits = tags.get(_SAMPLE_FORMAT, (1,))[0], tags.get(_BITS, (1,))[0]
     # Pillow inverts up to 8 bits only.
     inverted = tags.get(_PHOTOMETRIC) == 0
     white = 1.0 if kind == _FLOAT else 2.0 ** (bits - (kind == _SIGNED)) - 1.0
-    return _Scale(white, inverted, kind)
+    return white, inverted, kind
 
 
-def _to_eight_bits(image: Image.Image, scale: _Scale, name: str) -> tuple[Image.Image, Mask]:
-    """Return a grey picture of deep samples in 8 bits, and where its samples are numbers."""
+def _to_eight_bits(
+    image: Image.Image, white: float, inverted: bool, kind: int, name: str
+) -> tuple[Image.Image, Mask]:
+    """Return a grey picture in 8 bits, and where its samples are numbers; see `_scale_of`."""
     stored = np.asarray(image)
     if image.mode == "L":
         stored = stored.view(np.int8)
     levels = stored.astype(np.float64)
-    if scale.white >= 2.0**31 and scale.kind != _SIGNED:
+    if white >= 2.0**31 and kind != _SIGNED:
         # Pillow reads unsigned samples of 32 bits as signed ones.
         levels %= 2.0**32
-    levels /= scale.white
+    levels /= white
     numbers = ~np.isnan(levels)
     values = levels[numbers]
     largest = float(values.max(initial=0.0))
-    if scale.kind == _FLOAT and 2 * (values > BRIGHT).sum() > (values > 0.0).sum():
+    if kind == _FLOAT and 2 * (values > BRIGHT).sum() > (values > 0.0).sum():
         raise NPAError(
             f"target {shown(name)} has floats, of which 1 is white, but most of its values above 0 "
             f"are above {BRIGHT:g}, and the largest is {largest:g}: divide them by their white, or "
@@ -132,13 +147,15 @@ def _to_eight_bits(image: Image.Image, scale: _Scale, name: str) -> tuple[Image.
     ):
         if outside.any():
             left_out(name, f"{text}, at {outside.sum()} of {outside.size} pixels")
-    if scale.inverted:
+    if inverted:
         levels = 1.0 - levels
     elif 0.0 < largest < DARK:
-        text = f"its largest value is {largest * scale.white:g} of {scale.white:g}"
-        left_out(name, text, what="dark")
+        stored = f"{largest * white:g} of {white:.10g}"
+        left_out(name, f"its largest value is {stored}: scale its values", what="dark")
     levels = np.where(numbers, levels, 0.0) * 255.0
-    return Image.fromarray(levels.clip(0, 255).astype(np.uint8)), numbers
+    grey = Image.fromarray(levels.clip(0, 255).astype(np.uint8))
+    grey.info = image.info
+    return grey, numbers
 
 
 def _not_transparent(image: Image.Image, content: bytes) -> Mask | None:
