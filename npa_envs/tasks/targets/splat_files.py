@@ -62,7 +62,7 @@ _REST = (0, 9, 24, 45)
 
 
 @dataclass(frozen=True, eq=False)
-class Splats:
+class GaussianCloud:
     """N 3D Gaussians; y is up."""
 
     means: Tensor
@@ -96,7 +96,7 @@ def ply_kind(path: Path) -> str:
     return "gaussians" if trained else "points"
 
 
-def read_splats(path: Path) -> Splats:
+def read_splats(path: Path) -> GaussianCloud:
     """Return the point cloud or the trained Gaussians in a PLY file, in a ball of radius 0.85.
 
     The bounding box of the points, or of the middles of visible Gaussians, is centred at 0.
@@ -128,7 +128,7 @@ def _columns(file: MeshFile, vertex: Element, names: tuple[str, ...]) -> FloatAr
     return np.stack([vertex[name].values.astype(np.float64) for name in names], axis=1)
 
 
-def _trained_gaussians(file: MeshFile, vertex: Element) -> Splats:
+def _trained_gaussians(file: MeshFile, vertex: Element) -> GaussianCloud:
     """Return trained Gaussians, whose scales are logarithms and whose opacities are logits."""
     table = _columns(file, vertex, GAUSSIAN_NAMES)
     rest = sum(name.startswith("f_rest_") for name in vertex)
@@ -150,7 +150,7 @@ def _trained_gaussians(file: MeshFile, vertex: Element) -> Splats:
     return _fitted(file, "Gaussians", columns, summary)
 
 
-def _points(file: MeshFile, vertex: Element) -> Splats:
+def _points(file: MeshFile, vertex: Element) -> GaussianCloud:
     """Return a point cloud: each point as a Gaussian that is flat where its neighbours are."""
     hint = "pip install 'npa-envs[meshes]', or give triangles"
     with importing("scipy", f"reading the points of {shown(str(file.path))}", hint):
@@ -191,8 +191,10 @@ def _points(file: MeshFile, vertex: Element) -> Splats:
     return _fitted(file, "points", columns, f"{file.path.name}: {len(points)} points")
 
 
-def _fitted(file: MeshFile, what: str, columns: tuple[FloatArray, ...], summary: str) -> Splats:
-    """Return Gaussians (the fields of `Splats`) scaled into the ball, without strays."""
+def _fitted(
+    file: MeshFile, what: str, columns: tuple[FloatArray, ...], summary: str
+) -> GaussianCloud:
+    """Return Gaussians (the fields of `GaussianCloud`) scaled into the ball, without strays."""
     positions, sizes, _, shares, _ = columns
     finite = np.ones(len(positions), dtype=bool)
     for values in columns:
@@ -217,10 +219,10 @@ def _fitted(file: MeshFile, what: str, columns: tuple[FloatArray, ...], summary:
     means, scales, turns, opacities, harmonics = (
         torch.from_numpy(np.ascontiguousarray(each[near])).float() for each in columns
     )
-    return Splats(means, scales, turns, opacities, harmonics, summary)
+    return GaussianCloud(means, scales, turns, opacities, harmonics, summary)
 
 
-def draw_splats(splats: Splats, cameras: Cameras) -> Tensor:
+def draw_splats(splats: GaussianCloud, cameras: Cameras) -> Tensor:
     """Return pictures of Gaussians by V cameras, [V, H, W, 4]: colours times alpha, alpha.
 
     Gaussians have their own colours, without the light of meshes.
