@@ -128,15 +128,14 @@ def read_view_folder(
         )
     for views in (training, measured):
         views.cameras.world_to_camera[:, :3, 3] *= RADIUS / radius
-    with Image.open(splits[0][0].picture) as first:
-        size = f"{first.width} x {first.height}"
+    first = open_image(splits[0][0].picture)
     how = (
         "alpha"
         if background is None
         else f"their plain background, sRGB {background.astype(int).tolist()}"
     )
     counts = f"{len(splits[0])} views to train with, {len(splits[1])} held out"
-    summary = f"{folder.name}: {counts}, {size}, cut out by {how}"
+    summary = f"{folder.name}: {counts}, {first.width} x {first.height}, cut out by {how}"
     return ViewTarget(folder.name, training, measured, summary)
 
 
