@@ -166,9 +166,10 @@ class _Gltf:
     def _values(self, index: Any, rows: Any = slice(None)) -> FloatArray:
         """Return rows of an accessor, normalised if it says so, [any, components]."""
         raw = self._raw(index)[rows]
+        values: FloatArray = raw.astype(np.float64)
         if self._item("accessors", index).get("normalized") and raw.dtype.kind in "iu":
-            return np.maximum(raw / np.iinfo(raw.dtype).max, -1.0)
-        return raw.astype(np.float64)
+            values = np.maximum(values / np.iinfo(raw.dtype).max, -1.0)
+        return values
 
     # The scene.
 

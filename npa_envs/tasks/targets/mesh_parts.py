@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from npa_envs.atomic_files import read_bytes
 from npa_envs.errors import NPAError, shown
 from npa_envs.tasks.targets.images import decode_image
-from npa_envs.tasks.targets.meshes import MAX_FILE, FloatArray, Texture, Wrap
+from npa_envs.tasks.targets.meshes import MAX_FILE, FloatArray, MeshTexture, Wrap
 from npa_envs.tasks.targets.notes import left_out
 
 IntArray = NDArray[np.int64]
@@ -28,9 +28,9 @@ _VECTORISED = 40  # corners
 
 
 class FileTexture(NamedTuple):
-    """A texture of a mesh file, and the alpha of its pixels in [0, 1], which `Texture` has not."""
+    """A texture of a mesh file, and the alpha of its pixels in [0, 1], which meshes have not."""
 
-    texture: Texture
+    texture: MeshTexture
     lowest_alpha: float
     highest_alpha: float
 
@@ -44,7 +44,7 @@ class Part:
         faces: IntArray,
         colours: FloatArray | None = None,
         uv: FloatArray | None = None,
-        texture: Texture | None = None,
+        texture: MeshTexture | None = None,
     ) -> None:
         """Take the values of `Mesh`; a corner without a colour or a place in the texture has NaN.
 
@@ -118,7 +118,7 @@ class MeshFile:
                 raise NPAError(f"textures must have at most {_MAX_TEXELS} pixels: reduce them")
             pixels = np.array(image)
             lowest, highest = (float(f(pixels[..., 3])) / 255.0 for f in (np.min, np.max))
-            found = FileTexture(Texture(pixels[..., :3].copy(), wrap), lowest, highest)
+            found = FileTexture(MeshTexture(pixels[..., :3].copy(), wrap), lowest, highest)
         except NPAError as error:
             self.left_out(f"a texture: {error}")
         self._textures[name, wrap] = found
@@ -160,7 +160,8 @@ def unit_colours(values: NDArray[np.generic]) -> FloatArray:
     top = float(np.nan_to_num(values.astype(np.float64)).max(initial=0.0))
     whole = values.dtype.kind in "iu"
     scale = 65535.0 if top > 255.0 else 255.0 if whole or top > 2.0 else 1.0
-    return (values.astype(np.float64) / scale).clip(0.0, 1.0)
+    colours: FloatArray = (values.astype(np.float64) / scale).clip(0.0, 1.0)
+    return colours
 
 
 def triangulated(points: FloatArray, counts: IntArray) -> tuple[IntArray, IntArray]:
@@ -215,8 +216,9 @@ def _flattened(points: FloatArray) -> FloatArray:
     around = points - points[0]
     normal = np.cross(around, np.roll(around, -1, axis=0)).sum(axis=0)
     axis = int(np.abs(normal).argmax())
-    flat = around[:, [(axis + 1) % 3, (axis + 2) % 3]]
-    return flat if normal[axis] >= 0 else flat * (-1.0, 1.0)
+    flat: FloatArray = around[:, [(axis + 1) % 3, (axis + 2) % 3]]
+    flat[:, 0] *= 1.0 if normal[axis] >= 0 else -1.0
+    return flat
 
 
 def _is_convex(flat: FloatArray) -> bool:
