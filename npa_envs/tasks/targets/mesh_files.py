@@ -314,8 +314,8 @@ def _read_stl(file: MeshFile, content: bytes) -> list[Part]:
     """Return the parts of an STL file, one for each solid, with colours of triangles."""
     cure = "pip install 'npa-envs[meshes]', or save it as PLY or GLB"
     with importing("trimesh", f"reading the mesh {shown(str(file.path))}", cure):
-        from trimesh.exchange.stl import load_stl
-    read = load_stl(io.BytesIO(content))
+        import trimesh
+    read = trimesh.exchange.stl.load_stl(io.BytesIO(content))
     parts = []
     for solid in read["geometry"].values() if "geometry" in read else [read]:
         vertices = np.asarray(solid["vertices"], dtype=np.float64)
