@@ -500,6 +500,17 @@ def test_colours_of_corners_polygons_and_materials_are_read(
     assert caplog.messages == []
 
 
+def test_stl_files_may_have_more_at_their_end_but_not_less(tmp_path, caplog):
+    pytest.importorskip("trimesh")
+    path, content = tmp_path / "a.stl", stl([0x801F] * 12)
+    path.write_bytes(content + b"more")
+    cube(load_mesh(path), BLUE)
+    assert caplog.messages == ["a.stl: left out: 4 bytes after the end"]
+    path.write_bytes(content[:-50])
+    with pytest.raises(NPAError, match="ends too early"):
+        load_mesh(path)
+
+
 def test_shapes_without_colours_are_grey_with_a_word(tmp_path, caplog):
     (tmp_path / "miss.obj").write_text(
         "mtllib none.mtl\n" + OBJ + "usemtl r\nl 1 2\n" + OBJ_SIDES, encoding="utf-8"

@@ -315,6 +315,11 @@ def _read_stl(file: MeshFile, content: bytes) -> list[Part]:
     cure = "pip install 'npa-envs[meshes]', or save it as PLY or GLB"
     with importing("trimesh", f"reading the mesh {shown(str(file.path))}", cure):
         import trimesh
+    # trimesh takes what is followed by more bytes for text.
+    size = 84 + 50 * int.from_bytes(content[80:84], "little")
+    if 84 < size < len(content):
+        file.count_left_out(len(content) - size, "byte after the end", "bytes after the end")
+        content = content[:size]
     read = trimesh.exchange.stl.load_stl(io.BytesIO(content))
     parts = []
     for solid in read["geometry"].values() if "geometry" in read else [read]:
@@ -323,6 +328,8 @@ def _read_stl(file: MeshFile, content: bytes) -> list[Part]:
         if "face_attributes" in solid:
             colours = _stl_colours(np.asarray(solid["face_attributes"]["stl"]), content[:80])
         parts.append(Part(vertices, np.asarray(solid["faces"], dtype=np.int64), colours))
+    if not parts:
+        raise file.error("has no triangles, or ends too early for an STL file: save it again")
     return parts
 
 
