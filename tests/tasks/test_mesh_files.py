@@ -509,6 +509,12 @@ def test_stl_files_may_have_more_at_their_end_but_not_less(tmp_path, caplog):
     path.write_bytes(content[:-50])
     with pytest.raises(NPAError, match="ends too early"):
         load_mesh(path)
+    row = "facet normal 0 0 1\nouter loop\nvertex 0 0 0\nvertex 1 0 0\nvertex 0 1 0\nendloop\n"
+    path.write_text(f"solid\n{row * 2}endsolid\n", encoding="utf-8")
+    assert len(load_mesh(path).faces) == 2
+    path.write_text(f"solid\n{row}{row.replace('0 1 0', '0 1,5 0')}endsolid\n", encoding="utf-8")
+    with pytest.raises(NPAError, match="cannot be read as a mesh"):
+        load_mesh(path)
 
 
 def test_shapes_without_colours_are_grey_with_a_word(tmp_path, caplog):

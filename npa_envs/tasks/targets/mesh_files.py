@@ -320,7 +320,10 @@ def _read_stl(file: MeshFile, content: bytes) -> list[Part]:
     if 84 < size < len(content):
         file.count_left_out(len(content) - size, "byte after the end", "bytes after the end")
         content = content[:size]
-    read = trimesh.exchange.stl.load_stl(io.BytesIO(content))
+    with warnings.catch_warnings():
+        # Numbers after text that is none would be left out.
+        warnings.simplefilter("error", DeprecationWarning)
+        read = trimesh.exchange.stl.load_stl(io.BytesIO(content))
     parts = []
     for solid in read["geometry"].values() if "geometry" in read else [read]:
         vertices = np.asarray(solid["vertices"], dtype=np.float64)
