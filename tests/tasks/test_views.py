@@ -18,7 +18,7 @@ from npa_envs.tasks.targets.meshes import (
     AMBIENT,
     RADIUS,
     Mesh,
-    Texture,
+    MeshTexture,
     draw_mesh,
     linear_light,
     load_mesh,
@@ -425,7 +425,7 @@ def textured_plate(pixels, wrap, low, high):
     corners = np.array([(-0.6, -0.6, 0), (0.6, -0.6, 0), (0.6, 0.6, 0), (-0.6, 0.6, 0)])
     faces = np.array([(0, 1, 2), (0, 2, 3)])
     uv = np.array([(low, high), (high, high), (high, low), (low, low)], dtype=np.float64)
-    white, texture = np.ones((2, 3, 3)), Texture(pixels, wrap)
+    white, texture = np.ones((2, 3, 3)), MeshTexture(pixels, wrap)
     return Mesh(corners, faces, white, uv[faces], np.zeros(2, np.int64), (texture,))
 
 

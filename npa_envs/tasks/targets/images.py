@@ -210,7 +210,7 @@ def cut_out_background(image: Image.Image, *, label: str) -> Image.Image:
             "or give a PNG or WebP with a transparent background"
         )
     cut = cut_out(image, background)
-    if cut.getextrema()[3] == (0, 0):
+    if not np.asarray(cut.getchannel("A")).any():
         raise NPAError(
             f"target {shown(label)} is opaque and of one colour all over, nothing to grow: give a "
             "picture with an object, best a PNG with a transparent background; --keep-background "

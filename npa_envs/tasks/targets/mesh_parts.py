@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from npa_envs.atomic_files import read_bytes
 from npa_envs.errors import NPAError, shown
 from npa_envs.tasks.targets.images import decode_image
-from npa_envs.tasks.targets.meshes import MAX_FILE, FloatArray, Texture, Wrap
+from npa_envs.tasks.targets.meshes import MAX_FILE, FloatArray, MeshTexture, Wrap
 from npa_envs.tasks.targets.notes import left_out
 
 IntArray = NDArray[np.int64]
@@ -28,9 +28,9 @@ _VECTORISED = 40  # corners
 
 
 class FileTexture(NamedTuple):
-    """A texture of a mesh file, and the alpha of its pixels in [0, 1], which `Texture` has not."""
+    """A texture of a mesh file, and the alpha of its pixels in [0, 1], which meshes have not."""
 
-    texture: Texture
+    texture: MeshTexture
     lowest_alpha: float
     highest_alpha: float
 
@@ -44,7 +44,7 @@ class Part:
         faces: IntArray,
         colours: FloatArray | None = None,
         uv: FloatArray | None = None,
-        texture: Texture | None = None,
+        texture: MeshTexture | None = None,
     ) -> None:
         """Take the values of `Mesh`; a corner without a colour or a place in the texture has NaN.
 
@@ -118,7 +118,7 @@ class MeshFile:
                 raise NPAError(f"textures must have at most {_MAX_TEXELS} pixels: reduce them")
             pixels = np.array(image)
             lowest, highest = (float(f(pixels[..., 3])) / 255.0 for f in (np.min, np.max))
-            found = FileTexture(Texture(pixels[..., :3].copy(), wrap), lowest, highest)
+            found = FileTexture(MeshTexture(pixels[..., :3].copy(), wrap), lowest, highest)
         except NPAError as error:
             self.left_out(f"a texture: {error}")
         self._textures[name, wrap] = found

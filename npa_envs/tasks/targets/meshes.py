@@ -32,7 +32,7 @@ Wrap = Literal["repeat", "mirror", "clamp"]
 
 
 @dataclass(frozen=True, eq=False)
-class Texture:
+class MeshTexture:
     """A picture that lies on triangles."""
 
     pixels: NDArray[np.uint8]
@@ -57,7 +57,7 @@ class Mesh:
     left corner of the picture, and (1, 1) the lower right one. None: no triangle has a texture."""
     texture_of_face: NDArray[np.int64] | None = None
     """Index of each triangle's texture, -1 for none, shape [F]. None: none has one."""
-    textures: tuple[Texture, ...] = ()
+    textures: tuple[MeshTexture, ...] = ()
     """The textures."""
     summary: str = ""
     """What was read, in one line."""

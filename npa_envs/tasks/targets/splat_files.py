@@ -62,7 +62,7 @@ _REST = (0, 9, 24, 45)
 
 
 @dataclass(frozen=True, eq=False)
-class Splats:
+class GaussianCloud:
     """N 3D Gaussians; y is up."""
 
     means: Tensor
@@ -96,7 +96,7 @@ def ply_kind(path: Path) -> str:
     return "gaussians" if trained else "points"
 
 
-def read_splats(path: Path) -> Splats:
+def read_splats(path: Path) -> GaussianCloud:
     """Return the point cloud or the trained Gaussians in a PLY file, in a ball of radius 0.85.
 
     The bounding box of the points, or of the middles of visible Gaussians, is centred at 0.
@@ -128,7 +128,7 @@ def _columns(file: MeshFile, vertex: Element, names: tuple[str, ...]) -> FloatAr
     return np.stack([vertex[name].values.astype(np.float64) for name in names], axis=1)
 
 
-def _trained_gaussians(file: MeshFile, vertex: Element) -> Splats:
+def _trained_gaussians(file: MeshFile, vertex: Element) -> GaussianCloud:
     """Return trained Gaussians, whose scales are logarithms and whose opacities are logits."""
     table = _columns(file, vertex, GAUSSIAN_NAMES)
     rest = sum(name.startswith("f_rest_") for name in vertex)
@@ -150,7 +150,7 @@ def _trained_gaussians(file: MeshFile, vertex: Element) -> Splats:
     return _fitted(file, "Gaussians", columns, summary)
 
 
-def _points(file: MeshFile, vertex: Element) -> Splats:
+def _points(file: MeshFile, vertex: Element) -> GaussianCloud:
     """Return a point cloud: each point as a Gaussian that is flat where its neighbours are."""
     hint = "pip install 'npa-envs[meshes]', or give triangles"
     with importing("scipy", f"reading the points of {shown(str(file.path))}", hint):
@@ -191,34 +191,38 @@ def _points(file: MeshFile, vertex: Element) -> Splats:
     return _fitted(file, "points", columns, f"{file.path.name}: {len(points)} points")
 
 
-def _fitted(file: MeshFile, what: str, columns: tuple[FloatArray, ...], summary: str) -> Splats:
-    """Return Gaussians (the fields of `Splats`) scaled into the ball, without strays."""
-    means, scales, _, opacities, _ = columns
-    finite = np.ones(len(means), dtype=bool)
+def _fitted(
+    file: MeshFile, what: str, columns: tuple[FloatArray, ...], summary: str
+) -> GaussianCloud:
+    """Return Gaussians (the fields of `GaussianCloud`) scaled into the ball, without strays."""
+    positions, sizes, _, shares, _ = columns
+    finite = np.ones(len(positions), dtype=bool)
     for values in columns:
-        finite &= np.isfinite(values.reshape(len(means), -1)).all(axis=1)
-    seen = finite & (opacities >= VISIBLE_OPACITY)
+        finite &= np.isfinite(values.reshape(len(positions), -1)).all(axis=1)
+    seen = finite & (shares >= VISIBLE_OPACITY)
     if seen.sum() < 2:
         raise file.error(
             f"must hold {what} of an opacity of at least {VISIBLE_OPACITY}, got {seen.sum()}"
         )
-    away = np.linalg.norm(means - np.median(means[seen], axis=0), axis=1)
+    away = np.linalg.norm(positions - np.median(positions[seen], axis=0), axis=1)
     near = finite & (away <= STRAY * np.quantile(away[seen], 0.98))
     if not near.all():
         file.left_out(
             f"{int((~near).sum())} of {len(near)} {what}, far from the others or infinite"
         )
-    low, high = (f(means[seen & near], axis=0) for f in (np.min, np.max))
+    low, high = (f(positions[seen & near], axis=0) for f in (np.min, np.max))
     middle = 0.5 * (low + high)
-    size = np.linalg.norm(means[seen & near] - middle, axis=1).max()
+    size = np.linalg.norm(positions[seen & near] - middle, axis=1).max()
     if not size > 0.0:
         raise file.error(f"must hold {what} at several places, got all at one")
-    columns = ((means - middle) * (RADIUS / size), scales * (RADIUS / size), *columns[2:])
-    tensors = [torch.from_numpy(np.ascontiguousarray(each[near])).float() for each in columns]
-    return Splats(*tensors, summary)
+    columns = ((positions - middle) * (RADIUS / size), sizes * (RADIUS / size), *columns[2:])
+    means, scales, turns, opacities, harmonics = (
+        torch.from_numpy(np.ascontiguousarray(each[near])).float() for each in columns
+    )
+    return GaussianCloud(means, scales, turns, opacities, harmonics, summary)
 
 
-def draw_splats(splats: Splats, cameras: Cameras) -> Tensor:
+def draw_splats(splats: GaussianCloud, cameras: Cameras) -> Tensor:
     """Return pictures of Gaussians by V cameras, [V, H, W, 4]: colours times alpha, alpha.
 
     Gaussians have their own colours, without the light of meshes.

@@ -67,7 +67,7 @@ _NEEDLESS = (
 """Names in the files that say nothing more about pictures and cameras."""
 
 
-class Frame(NamedTuple):
+class FolderView(NamedTuple):
     """A picture and its camera, as a file describes them."""
 
     where: str
@@ -167,7 +167,7 @@ def scene_radius(views: Views) -> float:
 # What the files say.
 
 
-def _read_splits(folder: Path) -> tuple[list[Frame], list[Frame]]:
+def _read_splits(folder: Path) -> tuple[list[FolderView], list[FolderView]]:
     """Return the frames of a folder to train with, and others to measure by."""
     held_out = next((folder / name for name in HELD_OUT_FILES if (folder / name).is_file()), None)
     if held_out is not None and (folder / TRAINING_FILE).is_file():
@@ -188,7 +188,7 @@ def _read_splits(folder: Path) -> tuple[list[Frame], list[Frame]]:
     return others, frames[::HELD_OUT_INTERVAL]
 
 
-def _read_frames(path: Path) -> list[Frame]:
+def _read_frames(path: Path) -> list[FolderView]:
     """Return the frames of a `transforms*.json`."""
     file = shown(str(path))
     try:
@@ -211,7 +211,7 @@ def _read_frames(path: Path) -> list[Frame]:
     return found
 
 
-def _read_frame(path: Path, number: int, frame: Any, content: dict[str, Any]) -> Frame:
+def _read_frame(path: Path, number: int, frame: Any, content: dict[str, Any]) -> FolderView:
     """Return a frame of a `transforms*.json` with this content."""
     frame, where = frame if isinstance(frame, dict) else {}, f"frame {number} in {shown(str(path))}"
     name, matrix = frame.get("file_path"), frame.get("transform_matrix")
@@ -235,10 +235,10 @@ def _read_frame(path: Path, number: int, frame: Any, content: dict[str, Any]) ->
         file = next((each for each in files if each.is_file()), files[0])
     values = {key: frame.get(key, content.get(key)) for key in _LENS}
     given = {key: value for key, value in values.items() if value is not None}
-    return Frame(where, file, pose, given)
+    return FolderView(where, file, pose, given)
 
 
-def lens_of(frame: Frame, size: tuple[int, int]) -> Lens:
+def lens_of(frame: FolderView, size: tuple[int, int]) -> Lens:
     """Return the lens in front of a picture of this width and height [pixels]."""
     given, where = frame.lens, frame.where
     model = str(given.get("camera_model", "PINHOLE")).upper()
@@ -294,13 +294,13 @@ def _focal_length(given: Mapping[str, Any], where: str, axis: str, side: float) 
 # Pictures.
 
 
-def _thinned(frames: Sequence[Frame], count: int) -> list[Frame]:
+def _thinned(frames: Sequence[FolderView], count: int) -> list[FolderView]:
     """Return at most `count` evenly spaced frames."""
     total = len(frames)
     return [frames[k * total // min(count, total)] for k in range(min(count, total))]
 
 
-def _plain_background(folder: Path, frames: Sequence[Frame]) -> FloatImage | None:
+def _plain_background(folder: Path, frames: Sequence[FolderView]) -> FloatImage | None:
     """Return the colour behind the thing in opaque pictures, [3]; None: they have transparency."""
     edges = []
     for frame in frames:
@@ -316,12 +316,14 @@ def _plain_background(folder: Path, frames: Sequence[Frame]) -> FloatImage | Non
         raise NPAError(
             f"views must have a transparent background, or a plain one to cut out, but no picture "
             f"of {shown(str(folder))} has transparency, and only {share:.0%} of the pixels at "
-            "their edges have one colour: remove the background, and save PNGs with alpha"
+            "their edges have one colour: remove the background, and save PNG files"
         )
     return background
 
 
-def _views_of(frames: Sequence[Frame], resolution: int, background: FloatImage | None) -> Views:
+def _views_of(
+    frames: Sequence[FolderView], resolution: int, background: FloatImage | None
+) -> Views:
     """Return the views of frames, rotated so that y is up."""
     pictures, lenses = [], []
     for frame in frames:
@@ -342,7 +344,7 @@ def _views_of(frames: Sequence[Frame], resolution: int, background: FloatImage |
 
 
 def _square_view(
-    frame: Frame, resolution: int, background: FloatImage | None
+    frame: FolderView, resolution: int, background: FloatImage | None
 ) -> tuple[FloatImage, tuple[float, ...]]:
     """Return the picture of a frame, [R, R, 4], without distortion, and its fx, fy, cx and cy."""
     image = open_image(frame.picture)
