@@ -49,11 +49,12 @@ class Wound(NamedTuple):
         Inside it is negative. A cut moves what is within its width on both sides.
         """
         away = points - self.centre[:, None]
-        if self.normal is not None:
-            across = self.normal / torch.linalg.vector_norm(self.normal, dim=-1, keepdim=True)
-            away = (away * across[:, None]).sum(-1, keepdim=True)
-        distance: Tensor = torch.linalg.vector_norm(away, dim=-1) - self.size
-        return distance
+        if self.normal is None:
+            length: Tensor = torch.linalg.vector_norm(away, dim=-1)
+            return length - self.size
+        across = self.normal / torch.linalg.vector_norm(self.normal, dim=-1, keepdim=True)
+        height: Tensor = (away * across[:, None]).sum(-1).abs()
+        return height - self.size
 
 
 class LocalLoss:
