@@ -68,6 +68,8 @@ class RuleWorld(LiveWorld):
         choices: Other rules that the page offers, by name, as for `load_rule`; None: shipped ones.
     """
 
+    _generator: torch.Generator
+
     def __init__(
         self,
         source: str = "gecko",

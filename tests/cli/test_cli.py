@@ -344,7 +344,7 @@ MISTAKES = [
     ("train morphogenesis2d --config /nowhere.yaml", "cannot read the configuration file"),
     ("train TINY --out OUT --max-seconds -1", "max_seconds must be positive"),
     ("rollout nosuchrule --out OUT", "unknown rule 'nosuchrule'"),
-    ("rollout grid --out OUT", "grid is a target, and no rule for it is shipped: train one with npa-envs"),
+    ("rollout grid --out OUT", "grid is a target, and no rule for it is shipped: train one"),
     ("rollout RULE --out OUT --damage 5", "STEP:KIND"),
     ("rollout RULE --out OUT --steps 20 --damage 20:cut", "before the last of 20 steps"),
     ("rollout RULE --out OUT --target nosuchtarget", "nosuchtarget"),

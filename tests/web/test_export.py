@@ -111,7 +111,8 @@ def test_a_live_world_moves_and_the_same_seed_gives_the_same_world(run, settings
 
 PAUSE = {"type": "play", "on": False}
 BRUSHES = {
-    "wipe": {}, "remove": {}, "push": {"move": [0.05, -0.1]}, "clump": {}, "cut": {"move": [0.1, 0.2]},
+    "wipe": {}, "remove": {}, "clump": {},
+    "push": {"move": [0.05, -0.1]}, "cut": {"move": [0.1, 0.2]},
     "inject": {"source": [-0.1, 0.1]}, "inject nothing": {"source": [5.0, 5.0]},
     "graft": {},
 }  # fmt: skip

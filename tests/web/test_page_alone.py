@@ -77,10 +77,10 @@ def test_each_brush_sends_its_messages_at_its_time(run):
     """)
     # In tens of pixels from the middle: position, movement, and where the stroke began.
     assert strokes == {
-        **dict.fromkeys(
-            ("wipe", "clump", "noise", "remove"),
-            [[-1, 0, None], [-1, 0, None], [-1, 2, None], [1, 0, None]],
-        ),
+        **{
+            name: [[-1, 0, None], [-1, 0, None], [-1, 2, None], [1, 0, None]]
+            for name in ("wipe", "clump", "noise", "remove")
+        },
         "inject": [[-1, 0, -1], [-1, 0, -1], [-1, 2, -1], [1, 0, -1]],
         "push": [[-1, 0, None], [-1, 2, None]],
         "graft": [[-1, 0, None], [1, 0, None]],
