@@ -31,7 +31,7 @@ from npa_envs.web.export import page_rule, page_text
 from npa_envs.web.messages import TrainingEvent, WorldEvent
 from npa_envs.web.rule_world import RunWorld
 
-CHECKPOINTS = {False: 50, True: 200}
+CHECKPOINTS = {False: 25, True: 200}
 """Iterations between two checkpoints without and with CUDA: a few seconds."""
 
 
