@@ -157,7 +157,7 @@ class Training:
         output = self._call(words, folder, "reading the file", seconds=READ_SECONDS)
         if self._stopping.is_set():
             return self._set(state="stopped")
-        self._set(state="starting", note=output.replace(str(stored), self._report["name"]).strip())
+        self._set(state="starting", note=output.removeprefix(f"{stored.name}: ").strip())
         flat = (folder / PICTURE).exists()
         task = "morphogenesis2d" if flat else "morphogenesis3d"
         target = folder / PICTURE if flat else stored
