@@ -31,7 +31,7 @@ from npa_envs.web.export import page_rule, page_text
 from npa_envs.web.messages import TrainingEvent, WorldEvent
 from npa_envs.web.rule_world import RunWorld
 
-CHECKPOINTS = {False: 50, True: 200}
+CHECKPOINTS = {False: 25, True: 200}
 """Iterations between two checkpoints without and with CUDA: a few seconds."""
 
 
@@ -157,7 +157,7 @@ class Training:
         output = self._call(words, folder, "reading the file", seconds=READ_SECONDS)
         if self._stopping.is_set():
             return self._set(state="stopped")
-        self._set(state="starting", note=output.replace(str(stored), self._report["name"]).strip())
+        self._set(state="starting", note=output.removeprefix(f"{stored.name}: ").strip())
         flat = (folder / PICTURE).exists()
         task = "morphogenesis2d" if flat else "morphogenesis3d"
         target = folder / PICTURE if flat else stored
