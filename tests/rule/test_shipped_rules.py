@@ -7,7 +7,7 @@ import pytest
 
 import npa_envs
 from npa_envs.cli import main
-from npa_envs.measure.quality import accuracies, evaluate, score_line, scores
+from npa_envs.measure.quality import accuracies, evaluate, scores
 from npa_envs.rule.files import rule_metadata, shipped_rules
 from npa_envs.training.task_of_rule import task_of_rule
 
@@ -93,9 +93,23 @@ def test_clouds_say_what_they_are_as_measured(device):
 
 
 def test_the_list_tells_every_score(capsys):
-    assert main(["list"]) == 0
+    assert main(["list", "rules"]) == 0
     text = capsys.readouterr().out
     for name in RULES:
-        assert score_line(scores(name)) in text
-    assert "gecko: morphogenesis2d, 10880 weights; splat loss 0.087 at 128, 0.0835 at 256" in text
-    assert "98.1% of clouds by majority, 96.7% of particles at step 32" in text
+        (line,) = re.findall(rf"^    {name} +\d+ weights  (.*)$", text, re.MULTILINE)
+        measured = scores(name)
+        table, column, scale = "growth", "loss", 1.0
+        if "judge" in measured:
+            table, column = "judge", "ratio"
+        elif "accuracy" in measured:
+            table, column, scale = "accuracy", "majority", 100.0
+        elif measured["metric"] == "view loss":
+            column = "psnr"
+        stored = {row["step"]: scale * row[column] for row in measured[table]}
+        told = re.findall(r"([\d.]+)%? at (\d+)", line)
+        assert {step for _, step in told} == {str(n) for n in (32, 128, 512, 4096) if n in stored}
+        for value, step in told:
+            half = 0.501 * 10.0 ** -len(value.partition(".")[2])
+            assert float(value) == pytest.approx(stored[int(step)], abs=half)
+    assert "gecko       10880 weights  0.087 at 128, 0.083 at 512, 0.088 at 4096" in text
+    assert "digits      28170 weights  98.1% at 32" in text
