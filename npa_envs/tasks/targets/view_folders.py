@@ -369,6 +369,7 @@ def _square_view(
     return scaled_square(square, resolution), tuple(x * resolution / side for x in numbers)
 
 
+@np.errstate(all="ignore")
 def _undistorted(image: Image.Image, lens: Lens) -> Image.Image:
     """Return a picture as a pinhole with the same numbers shows it, transparent beyond its edges.
 
