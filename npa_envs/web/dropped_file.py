@@ -14,21 +14,17 @@ from pathlib import Path
 from PIL import Image
 
 from npa_envs.errors import NPAError, shown
-from npa_envs.tasks.targets.images import (
-    looks_like_path,
-    open_image,
-    read_image,
-    with_background,
-)
+from npa_envs.tasks.targets.images import looks_like_path, read_image, with_background
 from npa_envs.tasks.targets.meshes import MESH_SUFFIXES, load_mesh
 from npa_envs.tasks.targets.picture_points import is_emoji, render_emoji, target_from_image
+from npa_envs.tasks.targets.splat_files import ply_kind, read_splats
 from npa_envs.training.process_launcher import end_with_parent
 
 MAX_BYTES = 64 * 2**20
 """Maximum size of a dropped file [bytes]."""
 
 MAX_TRIANGLES = 2**20
-"""Maximum number of triangles of a dropped mesh."""
+"""Maximum number of triangles, points or Gaussians of a dropped 3D file."""
 
 MAX_SIDE = 1024
 """Maximum side of the picture that is learned [pixels]; larger ones are reduced."""
@@ -59,11 +55,12 @@ def read_dropped(path: Path, *, whole: bool = False) -> None:
     as `PICTURE` to the file's folder. With `whole` a picture keeps its background.
     """
     if path.suffix in MESH_SUFFIXES:
-        count = len(load_mesh(path).faces)
+        is_surface = path.suffix != ".ply" or ply_kind(path) == "triangles"
+        count = len(load_mesh(path).faces if is_surface else read_splats(path).means)
         if count > MAX_TRIANGLES:
             raise NPAError(
-                f"a dropped mesh must have at most {MAX_TRIANGLES} triangles, got {count}: "
-                "simplify it"
+                f"a dropped 3D file must have at most {MAX_TRIANGLES} triangles or points, got "
+                f"{count}: simplify it"
             )
         return
     if path.name == EMOJI:
@@ -74,7 +71,9 @@ def read_dropped(path: Path, *, whole: bool = False) -> None:
             )
         image = render_emoji(text)
     else:
-        image = with_background(open_image(path)) if whole else read_image(path)
+        image, line = read_image(path, keep_background=whole)
+        print(line)
+        image = with_background(image) if whole else image
     image.thumbnail((MAX_SIDE, MAX_SIDE), Image.Resampling.LANCZOS)
     # Raises if the picture is too thin to be sampled.
     target_from_image(image, name=str(path), point_count=512)
