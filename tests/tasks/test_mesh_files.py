@@ -500,6 +500,23 @@ def test_colours_of_corners_polygons_and_materials_are_read(
     assert caplog.messages == []
 
 
+def test_stl_files_may_have_more_at_their_end_but_not_less(tmp_path, caplog):
+    pytest.importorskip("trimesh")
+    path, content = tmp_path / "a.stl", stl([0x801F] * 12)
+    path.write_bytes(content + b"more")
+    cube(load_mesh(path), BLUE)
+    assert caplog.messages == ["a.stl: left out: 4 bytes after the end"]
+    path.write_bytes(content[:-50])
+    with pytest.raises(NPAError, match="ends too early"):
+        load_mesh(path)
+    row = "facet normal 0 0 1\nouter loop\nvertex 0 0 0\nvertex 1 0 0\nvertex 0 1 0\nendloop\n"
+    path.write_text(f"solid\n{row * 2}endsolid\n", encoding="utf-8")
+    assert len(load_mesh(path).faces) == 2
+    path.write_text(f"solid\n{row}{row.replace('0 1 0', '0 1,5 0')}endsolid\n", encoding="utf-8")
+    with pytest.raises(NPAError, match="cannot be read as a mesh"):
+        load_mesh(path)
+
+
 def test_shapes_without_colours_are_grey_with_a_word(tmp_path, caplog):
     (tmp_path / "miss.obj").write_text(
         "mtllib none.mtl\n" + OBJ + "usemtl r\nl 1 2\n" + OBJ_SIDES, encoding="utf-8"

@@ -250,7 +250,9 @@ class _Gltf:
     ) -> Part | None:
         """Return the triangles of a primitive, None if it has none or is invisible."""
         attributes = primitive["attributes"]
-        if mode in (0, 1, 2, 3) or "POSITION" not in attributes:
+        if mode not in (4, 5, 6) or "POSITION" not in attributes:
+            if mode not in (0, 1, 2, 3):
+                self.file.left_out(f"a part of mode {shown(mode)}, or without positions")
             return None
         position = attributes["POSITION"]
         compressed = _DRACO in primitive.get("extensions", {})

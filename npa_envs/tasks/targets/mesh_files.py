@@ -314,8 +314,16 @@ def _read_stl(file: MeshFile, content: bytes) -> list[Part]:
     """Return the parts of an STL file, one for each solid, with colours of triangles."""
     cure = "pip install 'npa-envs[meshes]', or save it as PLY or GLB"
     with importing("trimesh", f"reading the mesh {shown(str(file.path))}", cure):
-        from trimesh.exchange.stl import load_stl
-    read = load_stl(io.BytesIO(content))
+        import trimesh
+    # trimesh takes what is followed by more bytes for text.
+    size = 84 + 50 * int.from_bytes(content[80:84], "little")
+    if 84 < size < len(content):
+        file.count_left_out(len(content) - size, "byte after the end", "bytes after the end")
+        content = content[:size]
+    with warnings.catch_warnings():
+        # Numbers after text that is none would be left out.
+        warnings.simplefilter("error", DeprecationWarning)
+        read = trimesh.exchange.stl.load_stl(io.BytesIO(content))
     parts = []
     for solid in read["geometry"].values() if "geometry" in read else [read]:
         vertices = np.asarray(solid["vertices"], dtype=np.float64)
@@ -323,6 +331,8 @@ def _read_stl(file: MeshFile, content: bytes) -> list[Part]:
         if "face_attributes" in solid:
             colours = _stl_colours(np.asarray(solid["face_attributes"]["stl"]), content[:80])
         parts.append(Part(vertices, np.asarray(solid["faces"], dtype=np.int64), colours))
+    if not parts:
+        raise file.error("has no triangles, or ends too early for an STL file: save it again")
     return parts
 
 
