@@ -327,7 +327,9 @@ def test_hardly_transparent_pictures_are_cut_out_of_their_background(tmp_path, c
     rgba[0, 0, 3] = min(rgba[0, 0, 3], corner)
     Image.fromarray(rgba).save(tmp_path / "square.png")
     image, summary = read_image(tmp_path / "square.png")
-    assert (np.asarray(image)[..., 3] >= 128).sum() == 256
+    alpha = np.asarray(image)[..., 3]
+    assert (alpha >= 128).sum() == 256
+    assert alpha.max() == rgba[..., 3].max()
     assert summary == "square.png: 40 x 40, cut out of its background, 16 % of its pixels"
 
 

@@ -78,13 +78,14 @@ def correct_tiles(opened: ImageFile.ImageFile) -> None:
     """
     tags: Any = getattr(opened, "tag_v2", {})
     planes = tags.get(_PLANES) == _SEPARATE and max(tags.get(_BITS, (1,))) == 16
-    for k, tile in enumerate(opened.tile if tags else ()):
+    tiles: list[Any] = opened.tile if tags else []
+    for k, tile in enumerate(tiles):
         mode, *others = tile.args
         if tile.codec_name == "libtiff":
             mode = _NATIVE_MODES.get(mode, mode)
         elif planes and len(mode) == 1:
             mode += ";16B" if tags.prefix == b"MM" else ";16L"
-        opened.tile[k] = tile._replace(args=(mode, *others))
+        tiles[k] = tile._replace(args=(mode, *others))
 
 
 def kind_of_tiff(content: bytes) -> str:
@@ -150,8 +151,8 @@ def _to_eight_bits(
     if inverted:
         levels = 1.0 - levels
     elif 0.0 < largest < DARK:
-        stored = f"{largest * white:g} of {white:.10g}"
-        left_out(name, f"its largest value is {stored}: scale its values", what="dark")
+        text = f"its largest value is {largest * white:g} of {white:.10g}: scale its values"
+        left_out(name, text, what="dark")
     levels = np.where(numbers, levels, 0.0) * 255.0
     grey = Image.fromarray(levels.clip(0, 255).astype(np.uint8))
     grey.info = image.info
@@ -179,8 +180,8 @@ def _not_transparent(image: Image.Image, content: bytes) -> Mask | None:
             low.tile = [tile._replace(args="RGB;16L") for tile in low.tile]
             lower = np.asarray(ImageOps.exif_transpose(low))
         samples = samples.astype(np.uint16) * 256 + lower
-    different: Mask = samples.reshape(*samples.shape[:2], -1) != np.array(transparent)
-    return different.any(axis=-1)
+    different = samples.reshape(*samples.shape[:2], -1) != np.array(transparent)
+    return np.asarray(different.any(axis=-1))
 
 
 def _in_srgb(image: Image.Image, profile: bytes, name: str) -> Image.Image | None:
