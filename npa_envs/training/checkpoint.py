@@ -98,8 +98,9 @@ def check_same_run(
     check_task(content, task_name, path)
     try:
         stored = json.loads(json.dumps(content["config"]))
-        unset = type(config)(task=type(config.task)())
-        theirs = _flat(_completed(stored, config_to_dict(unset)))
+        # Settings that the run does not have are newer than it is.
+        unset = config_to_dict(type(config)(task=type(config.task)()))
+        theirs = _flat(unset) | _flat(stored)
     except (TypeError, ValueError, KeyError, AttributeError, RecursionError) as error:
         raise unusable_checkpoint(path, f"config cannot be read ({shown(error)})") from error
     ours = _flat(config_to_dict(config))
@@ -142,15 +143,6 @@ def unusable_checkpoint(path: Path, reason: str) -> NPAError:
         f"the checkpoint {str(path)!r} must hold all that a run needs, but {reason}: "
         "start a new run with overwrite, or put a copy of it in its place"
     )
-
-
-def _completed(config: Any, unset: Any) -> Any:
-    """Return a stored configuration, with the values of `unset` for fields newer than it is."""
-    if isinstance(config, dict) and isinstance(unset, dict):
-        return unset | {name: _completed(value, unset.get(name)) for name, value in config.items()}
-    if isinstance(config, list) and isinstance(unset, list) and unset:
-        return [_completed(each, unset[0]) for each in config]
-    return config
 
 
 def _flat(config: dict[str, Any]) -> dict[str, Any]:

@@ -199,7 +199,7 @@ def test_a_mesh_of_too_many_triangles_is_refused(tmp_path, monkeypatch):
     path.write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 2 3\nf 1 2 4\n", encoding="utf-8")
     read_dropped(path)
     monkeypatch.setattr(dropped_file, "MAX_TRIANGLES", 1)
-    with pytest.raises(NPAError, match="at most 1 triangles, got 2"):
+    with pytest.raises(NPAError, match="at most 1 triangles or points, got 2"):
         read_dropped(path)
 
 
