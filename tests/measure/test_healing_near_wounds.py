@@ -9,8 +9,9 @@ import torch
 import npa_envs.measure.quality
 from npa_envs.errors import NPAError
 from npa_envs.measure.quality import healing, step_count, tables_of
-from npa_envs.measure.wounds import LocalLoss, Wound, part_names
+from npa_envs.measure.wounds import LocalLoss, part_names, wounded
 from npa_envs.rule.rule import NPARule
+from npa_envs.tasks.damage import Wound
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2D
 from npa_envs.tasks.morphogenesis3d import Morphogenesis3D
 from npa_envs.tasks.seeds import spread_points
@@ -73,7 +74,7 @@ def test_the_loss_near_a_wound_is_the_mean_over_its_pixels_and_the_bound_follows
     assert float(loss.before) == pytest.approx(local, rel=1e-4)
     assert float(loss(before)) == pytest.approx(local, rel=1e-4)
     assert float(loss.bound) == pytest.approx(max(1.25 * local, local + 0.1 * whole), rel=1e-4)
-    hurt = Wound("wipe", centre, 0.2).of(task, before)
+    hurt = wounded(task, before, Wound("wipe", centre, 0.2))
     blank = (hurt.s[0] == 0.0).all(-1)
     assert torch.equal(blank, (before.x[0] - centre[0]).norm(dim=-1) <= 0.2)
     assert float(loss(hurt)) > 2.0 * float(loss.bound)
@@ -84,7 +85,7 @@ def test_what_happens_elsewhere_does_not_count(task):
     first, second = task.spread_places(2, before).unbind(1)
     assert float((first - second).norm()) > 1.0
     loss = LocalLoss(task, before, Wound("wipe", first, 0.2))
-    elsewhere = Wound("wipe", second, 0.2).of(task, before)
+    elsewhere = wounded(task, before, Wound("wipe", second, 0.2))
     assert float(loss(elsewhere)) == pytest.approx(float(loss.before), rel=1e-5)
 
 
@@ -97,7 +98,7 @@ def test_turned_worlds_are_wounded_at_the_same_places_of_the_picture():
     for worlds in (before, turned):
         wound = Wound("wipe", task.spread_places(3, worlds)[:, 1], 0.2)
         loss = LocalLoss(task, worlds, wound)
-        losses.append((float(loss.before), float(loss(wound.of(task, worlds)))))
+        losses.append((float(loss.before), float(loss(wounded(task, worlds, wound)))))
     assert losses[0] == pytest.approx(losses[1], rel=0.15)
     assert losses[0][1] > 2.0 * losses[0][0]
 
