@@ -5,7 +5,8 @@ from dataclasses import astuple, replace
 
 import pytest
 import torch
-from support.circle_task import PARTICLE_COUNT, STATE_DIM, CircleTask
+from support.circle_task import STATE_DIM, CircleTask
+from support.training_runs import grown, heart_task
 
 import npa_envs.measure.quality
 from npa_envs.errors import NPAError
@@ -13,7 +14,6 @@ from npa_envs.measure.quality import evaluate, healing, psnr, step_count, tables
 from npa_envs.measure.wounds import LocalLoss, part_names, wounded
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.damage import Wound
-from npa_envs.tasks.morphogenesis2d import Morphogenesis2D
 from npa_envs.tasks.morphogenesis3d import Morphogenesis3D
 from npa_envs.tasks.seeds import spread_points
 from npa_envs.training import TASKS, preset
@@ -109,21 +109,6 @@ def test_worlds_that_run_away_have_not_healed(monkeypatch):
         assert (row.steps_to_heal, row.worlds_healed) == (None, 0)
 
 
-def test_wiped_disk_blanks_states_of_the_grown_world(monkeypatch):
-    seen = []
-
-    def fill(rule, worlds, steps, **options):
-        seen.append((worlds.s == 0).all(-1).float().mean(1).tolist())
-        return worlds._replace(s=torch.ones_like(worlds.s))
-
-    monkeypatch.setattr(npa_envs.measure.quality, "rollout_particles", fill)
-    steps = dict.fromkeys(("grow_steps", "heal_steps", "every"), 1)
-    healing(make_rule(0.0), CircleTask(), **steps, seeds=[0], wipe_radius=0.1)
-    blank_after_cut, blank_after_erasure = seen[1][0], seen[2][0]
-    assert blank_after_cut == 0
-    assert 1 / PARTICLE_COUNT <= blank_after_erasure < 1
-
-
 @pytest.mark.parametrize(
     ("measured", "options", "rule"),
     [
@@ -143,27 +128,9 @@ def test_wrong_arguments_are_named(measured, options, rule):
 # Healing near wounds: which pixels count, what is healed, and of which rules.
 
 
-COUNT = 512
-
-
-def heart(**fields):
-    sizes = {"resolution": 64, "particle_count": COUNT, "target_point_count": COUNT}
-    return Morphogenesis2D(preset("tiny", target="heart", **sizes, **fields).task)
-
-
 @pytest.fixture(scope="module")
 def task():
-    return heart()
-
-
-def grown(task):
-    """A world that is the target but for a little noise, somewhere else."""
-    points, colours = task.target.points, task.target.colours
-    noise = 0.005 * torch.randn(points.shape, generator=torch.Generator().manual_seed(3))
-    x = (points + noise + torch.tensor([0.2, -0.1]))[None]
-    s = x.new_zeros(1, len(points), task.config.state_dim)
-    s[..., -3:] = colours - 0.5
-    return Particles(x, s)
+    return heart_task()
 
 
 def test_distances_from_wounds_are_those_from_what_is_moved_or_wiped():
@@ -186,7 +153,7 @@ def test_places_are_far_from_each_other():
 
 
 def test_the_loss_near_a_wound_is_the_mean_over_its_pixels_and_the_bound_follows_the_rule(task):
-    before = grown(task)
+    before = grown(task, 1, 0.005)
     centre = task.spread_places(4, before)[:, 2]
     in_target = centre[0] - before.x[0].mean(0) + task.target.points.mean(0)
     at = torch.linspace(-1.0, 1.0, 64)
@@ -206,7 +173,7 @@ def test_the_loss_near_a_wound_is_the_mean_over_its_pixels_and_the_bound_follows
 
 
 def test_what_happens_elsewhere_does_not_count(task):
-    before = grown(task)
+    before = grown(task, 1, 0.005)
     first, second = task.spread_places(2, before).unbind(1)
     assert float((first - second).norm()) > 1.0
     loss = LocalLoss(task, before, Wound("wipe", first, 0.2))
@@ -215,8 +182,8 @@ def test_what_happens_elsewhere_does_not_count(task):
 
 
 def test_turned_worlds_are_wounded_at_the_same_places_of_the_picture():
-    task = heart(equivariant=True, seed_across=0.5)
-    before = grown(task)
+    task = heart_task(equivariant=True, seed_across=0.5)
+    before = grown(task, 1, 0.005)
     cos, sin = math.cos(2.0), math.sin(2.0)
     turned = before._replace(x=before.x @ torch.tensor([[cos, sin], [-sin, cos]]))
     losses = []
@@ -233,7 +200,7 @@ def healed_by(monkeypatch, task, courses, **options):
 
     They are, for each check after a wound, "whole" or "hurt".
     """
-    start = grown(task)
+    start = grown(task, 1, 0.005)
     monkeypatch.setattr(task, "seed", lambda *_, **__: start)
     later = iter(courses)
 
@@ -258,7 +225,7 @@ def healed_by(monkeypatch, task, courses, **options):
 def test_wounds_are_healed_where_they_are_within_the_bound_at_both_checks(
     monkeypatch, courses, healed
 ):
-    rows = healed_by(monkeypatch, heart(), courses)
+    rows = healed_by(monkeypatch, heart_task(), courses)
     assert [(row.damage, row.wounds, row.changed) for row in rows] == [
         ("cut, gap 0.1", 5, 5),
         ("wipe, radius 0.2", 5, 5),
@@ -274,13 +241,13 @@ def test_wounds_are_healed_where_they_are_within_the_bound_at_both_checks(
 
 
 def test_wounds_that_change_nothing_do_not_count(monkeypatch):
-    rows = healed_by(monkeypatch, heart(), ["whole"] * 4, wipe_radius=0.0, cut_gap=1e-6)
+    rows = healed_by(monkeypatch, heart_task(), ["whole"] * 4, wipe_radius=0.0, cut_gap=1e-6)
     assert [(row.wounds, row.changed, row.healed) for row in rows] == [(5, 0, 0)] * 2
     assert all(math.isnan(row.before) for row in rows)
 
 
 def test_a_cpu_has_six_places_in_one_world_and_every_number_is_checked():
-    task = heart()
+    task = heart_task()
     rule = NPARule(2, task.config.state_dim, 8, eps0=task.eps)
     rows = healing(rule, task, grow_steps=2, heal_steps=2, seeds=[3, 4])
     assert [row.wounds for row in rows] == [6, 6]

@@ -4,7 +4,7 @@ import pytest
 import torch
 from support.circle_task import CircleTask, circle_config
 from support.small_digits import write_idx
-from support.training_runs import Recording, make_cycle, runaway
+from support.training_runs import Recording, grown, heart_task, make_cycle, runaway
 from support.worlds import assert_same
 
 from npa_envs.errors import NPAError
@@ -166,19 +166,9 @@ def test_eps_is_varied_only_where_it_can_be(tmp_path, task, fields, message):
 AGED = {"max_age_range": (8, 64), "damage_share": 0.0, "wound_weight": 0.5}
 
 
-def grown(task):
-    """Two worlds that are the target, not in its place, as rules grow it."""
-    points, colours = task.target.points, task.target.colours
-    x = (points + torch.tensor([0.2, -0.1])).expand(2, -1, -1).clone()
-    s = x.new_zeros(*x.shape[:2], task.config.state_dim)
-    s[..., -3:] = colours - 0.5
-    return Particles(x, s)
-
-
 @pytest.fixture(scope="module")
 def task():
-    fields = {"target": "heart", "resolution": 64, "particle_count": 512}
-    return Morphogenesis2D(preset("tiny", **fields, target_point_count=512).task)
+    return heart_task()
 
 
 def distances(task, centre):
@@ -188,7 +178,7 @@ def distances(task, centre):
 
 
 def test_wounds_are_the_pixels_of_the_centred_picture_that_a_damage_changes(task):
-    before = grown(task)
+    before = grown(task, 2, 0.0)
     centre = before.x[:, 100]
     s = wipe_state(*before[:2], centre=centre, radius=0.2)
     s[1] = before.s[1]
@@ -209,7 +199,7 @@ def test_wounds_are_the_pixels_of_the_centred_picture_that_a_damage_changes(task
 
 
 def test_the_loss_adds_the_mean_over_the_wound(task):
-    worlds = grown(task)
+    worlds = grown(task, 2, 0.0)
     x = worlds.x.clone().requires_grad_()
     s = worlds.s + 0.1
     wounds = torch.zeros(2, 64, 64, dtype=torch.uint8)
@@ -250,17 +240,6 @@ def test_the_pool_remembers_a_wound_until_the_world_is_replaced(tmp_path):
         assert torch.equal(cycle.pool.wounds[index], cycle.batch.wounds)
     assert new > 5
     assert kept > 5
-
-
-def test_a_resumed_run_remembers_wounds(tmp_path):
-    wounded = AGED | {"damage_share": 0.5, "iterations": 12, "milestones": (3,)}
-    fields = wounded | {"checkpoint_interval": 6}
-    whole = train(preset("tiny", out=tmp_path / "whole", **fields), progress=False)
-    parts = preset("tiny", out=tmp_path / "parts", **fields)
-    train(parts, progress=False, max_seconds=0.0)
-    resumed = train(parts, progress=False, resume=True)
-    assert resumed.finished
-    assert_same(resumed.rule.state_dict(), whole.rule.state_dict())
 
 
 @pytest.mark.parametrize(

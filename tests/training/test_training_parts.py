@@ -183,17 +183,6 @@ def test_worlds_that_do_not_move_have_finite_gradients_of_stillness(tmp_path, po
     assert all(gradient.isfinite().all() for gradient in iteration.gradients)
 
 
-def test_a_parameter_outside_the_loss_gets_a_zero_gradient(tmp_path):
-    task, rule, iteration = make_iteration(circle_config(tmp_path))
-    rule.unused = nn.Parameter(torch.ones(2))
-    iteration = EagerIteration(
-        task, rule, circle_config(tmp_path), iteration.start, torch.Generator(), plain_rollout
-    )
-    rule.unused.grad.fill_(5.0)
-    iteration.run(2)
-    assert rule.unused.grad.tolist() == [0.0, 0.0]
-
-
 def test_statistics_are_the_means_of_the_interval(tmp_path, device):
     _, _, iteration = make_iteration(circle_config(tmp_path), device=device)
     statistics, resumed = LossStatistics(iteration), LossStatistics(iteration)
