@@ -210,24 +210,20 @@ def healing(
     for name, wound in wounds.items():
         worlds = wounded(task, Particles(x, grown.s), wound)
         losses = torch.stack([task.metric(now.x, now.s) for _, now in runner.at(steps, worlds)])
-        rows.append(_healing_row(name, before, steps, losses))
+        diverged = ~(losses[-1] <= DIVERGED_FACTOR * before)
+        mean_healed = ((losses.mean(1) <= HEALED * before.mean()) & ~diverged.all()).tolist()
+        healed = [step for step, is_healed in zip(steps, mean_healed, strict=True) if is_healed]
+        row = HealingRow(
+            damage=name,
+            before=before.mean().item(),
+            after=losses[0].mean().item(),
+            steps_to_heal=healed[0] if healed else None,
+            worlds_healed=int(((losses <= HEALED * before).any(0) & ~diverged).sum()),
+            world_count=len(before),
+            end=losses[-1].mean().item(),
+        )
+        rows.append(row)
     return rows
-
-
-def _healing_row(damage: str, before: Tensor, steps: Sequence[int], losses: Tensor) -> HealingRow:
-    """Return a row from losses [B] `before` a damage, and [len(steps), B] at `steps` after it."""
-    diverged = ~(losses[-1] <= DIVERGED_FACTOR * before)
-    mean_healed = ((losses.mean(1) <= HEALED * before.mean()) & ~diverged.all()).tolist()
-    healed = [step for step, is_healed in zip(steps, mean_healed, strict=True) if is_healed]
-    return HealingRow(
-        damage=damage,
-        before=before.mean().item(),
-        after=losses[0].mean().item(),
-        steps_to_heal=healed[0] if healed else None,
-        worlds_healed=int(((losses <= HEALED * before).any(0) & ~diverged).sum()),
-        world_count=len(before),
-        end=losses[-1].mean().item(),
-    )
 
 
 # Rules that classify clouds

@@ -309,7 +309,7 @@ class RuleTrial:
         several = len(self._tasks[self.particle_count]) > 1
         if several or not self.task.grows_picture or damage not in ("wipe", "cut", "clump"):
             return None
-        return _wound(damage, x, self.random(StreamId.DAMAGE), self.task.box)
+        return random_wound(damage, DAMAGE_SIZES[damage], x, self.random(StreamId.DAMAGE))
 
     def by_seed(self, losses: Tensor) -> Tensor:
         """Return the mean loss of each seed's worlds, [..., seeds], of losses [..., B]."""
@@ -336,16 +336,14 @@ class Damage(NamedTuple):
     """Whether it removes half of the particles."""
 
 
-def _wound(kind: str, x: Tensor, random: WorldRandom, box: Box) -> Wound:
-    """Return a wound of its usual size; in a periodic box cuts run through random particles."""
-    return random_wound(kind, DAMAGE_SIZES[kind], x, random, anywhere=box is not None)
-
-
 def inflict(
     kind: str, x: Tensor, s: Tensor, random: WorldRandom, box: Box
 ) -> tuple[Tensor, Tensor]:
-    """Return x and s with a wound; a clump's particles all move to its centre."""
-    wound = _wound(kind, x, random, box)
+    """Return x and s with a wound; a clump's particles all move to its centre.
+
+    In a periodic box cuts run through a random particle.
+    """
+    wound = random_wound(kind, DAMAGE_SIZES[kind], x, random, anywhere=box is not None)
     if kind == "wipe":
         return wound.inflict(x, s, box)
     # In coordinates whose origin is the wound.
