@@ -425,7 +425,14 @@ class ConcatenatedSpeciesEnv(MultiSpeciesVectorEnv):
             "acted": self._by_particle(acted),
             "particle_terminated": self._by_particle(terminated),
         }
-        self._update_reasons(infos)
+        # Why each world ends: the first reason of a species, or "left the world" of any.
+        for agent in self.agents:
+            reasons = infos[agent].get("reason")
+            if reasons is not None:
+                new = reasons != None  # noqa: E711
+                known = (self._reasons != None) & (self._reasons != TIME_LIMIT)  # noqa: E711
+                replaced = (new & ~known) | (reasons == LEFT_WORLD)
+                self._reasons = np.where(replaced, reasons, self._reasons)
         cut, first = truncated.any(dim=1), infos[self.agents[0]]
         over = first.get("_final_obs", torch.zeros_like(cut))
         if "final_obs" in first:
@@ -438,16 +445,6 @@ class ConcatenatedSpeciesEnv(MultiSpeciesVectorEnv):
             info |= {"final_info": final, "_final_info": over}
         observation, reward = self._concatenated(observations), rewards.mean(dim=1)
         return observation, reward, over & ~cut, over & cut, info
-
-    def _update_reasons(self, infos: Mapping[str, Mapping[str, Any]]) -> None:
-        """Store why each world ends: the first reason of a species, or "left the world" of any."""
-        for agent in self.agents:
-            reasons = infos[agent].get("reason")
-            if reasons is not None:
-                new = reasons != None  # noqa: E711
-                known = (self._reasons != None) & (self._reasons != TIME_LIMIT)  # noqa: E711
-                replaced = (new & ~known) | (reasons == LEFT_WORLD)
-                self._reasons = np.where(replaced, reasons, self._reasons)
 
     def _concatenated(self, values: Mapping[str, Tensor]) -> Tensor:
         return torch.cat([values[agent] for agent in self.agents], dim=1)
