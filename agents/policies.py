@@ -108,7 +108,8 @@ class Policy:
         if not observations:
             return {}
         # One particle's observation, [P], is a row as well.
-        rows = {a: torch.atleast_2d(torch.as_tensor(one)) for a, one in observations.items()}
+        given = zip(observations, map(torch.as_tensor, observations.values()), strict=True)
+        rows = {agent: rows if rows.ndim > 1 else rows[None] for agent, rows in given}
         spans = self._spans({agent: values.shape[-2] for agent, values in rows.items()})
         joined = _joined(rows, spans)
         actions = self._act_on(joined).to(joined.device)
