@@ -51,20 +51,15 @@ class BrushPolicy:
         return actions if isinstance(array, Tensor) else actions.cpu().numpy()
 
     def act(self) -> Tensor:
-        """Return actions, float32, [B, J, W]: W columns of `BrushLayout` for each of J brushes."""
-        raise NotImplementedError
+        """Return actions, float32, [B, J, W]: W columns of `BrushLayout` for each of J brushes.
 
-    def still(self) -> Tensor:
-        """Return actions that do nothing: zeros, [B, J, W]."""
+        By default they are zeros, which do nothing.
+        """
         return torch.zeros(self.worlds.world_count, *self.shape, device=self.task.device)
 
 
 class StillGardener(BrushPolicy):
     """Do nothing, so that only the rule acts."""
-
-    def act(self) -> Tensor:
-        """Return zeros, float32 [B, J, W], for B worlds of J brushes and W columns of actions."""
-        return self.still()
 
 
 class RandomGardener(BrushPolicy):
@@ -109,7 +104,7 @@ class ScriptedGardener(BrushPolicy):
 
     def act(self) -> Tensor:
         """Return actions that push particles to places with a deficit, shape [B, J, W]."""
-        worlds, action = self.worlds, self.still()
+        worlds, action = self.worlds, super().act()
         deficit = self._deficit(worlds.particles, self.task.middle(worlds.x))
         pull = torch.einsum("bq,pqd->bpd", deficit[..., 0].double(), self._pulls).to(deficit.dtype)
         move = (self._gain * deficit[..., 1:3] + pull).clamp(-1.0, 1.0)
@@ -152,7 +147,7 @@ class ScriptedShepherd(BrushPolicy):
 
     def act(self) -> Tensor:
         """Return actions that push particles towards each world's goal, shape [B, J, W]."""
-        worlds, action = self.worlds, self.still()
+        worlds, action = self.worlds, super().act()
         achieved = self.task.achieved(worlds.particles, worlds.context)
         missing = (self.task.desired(worlds.context) - achieved)[:, None, :2]
         if self.config.aim == "move":
@@ -197,7 +192,7 @@ class GradientGardener(BrushPolicy):
         """Return the actions of the first step of the best plan found, shape [B, J, W]."""
         random = self._random.next_step(self.worlds.world_count, self.task.device)
         first = self._scripted.act()
-        plan = torch.stack([first] + [self.still()] * (self._horizon - 1))
+        plan = torch.stack([first] + [super().act()] * (self._horizon - 1))
         plan[1:, ..., self.columns.place] = first[..., self.columns.place]
         plan = plan.requires_grad_()
         optimiser = torch.optim.Adam([plan], lr=self._learning_rate)

@@ -107,7 +107,9 @@ class Policy:
         """Return actions by agent, for observations [P], [N_k, P] or [B, N_k, P] of agent k."""
         if not observations:
             return {}
-        rows = {agent: _as_rows(values) for agent, values in observations.items()}
+        # One particle's observation, [P], is a row as well.
+        given = zip(observations, map(torch.as_tensor, observations.values()), strict=True)
+        rows = {agent: rows if rows.ndim > 1 else rows[None] for agent, rows in given}
         spans = self._spans({agent: values.shape[-2] for agent, values in rows.items()})
         joined = _joined(rows, spans)
         actions = self._act_on(joined).to(joined.device)
@@ -130,12 +132,6 @@ class Policy:
             )
         action = self.act(observation[..., :columns].float().reshape(-1, shape[-2], columns))
         return action.view(*shape[:-1], self.interface.action_dim)
-
-
-def _as_rows(observed: Any) -> Tensor:
-    """Return an agent's observations as a tensor, a row for each particle, [..., N_k, P]."""
-    rows = torch.as_tensor(observed)
-    return rows if rows.ndim > 1 else rows[None]
 
 
 def _joined(rows: Mapping[str, Tensor], spans: Mapping[str, slice]) -> Tensor:

@@ -8,6 +8,7 @@ import pkgutil
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from npa_envs.wrappers.base import ParticleRows as ParticleRows
     from npa_envs.wrappers.damage import DamageEvents as DamageEvents
     from npa_envs.wrappers.damage import VectorDamageEvents as VectorDamageEvents
     from npa_envs.wrappers.episode_statistics import (
@@ -18,7 +19,6 @@ if TYPE_CHECKING:
     from npa_envs.wrappers.normalize import TorchNormalizeReward as TorchNormalizeReward
     from npa_envs.wrappers.normalize import VectorNormalizePerception as VectorNormalizePerception
     from npa_envs.wrappers.numeric_infos import NumericInfos as NumericInfos
-    from npa_envs.wrappers.particles_as_envs import ParticleRows as ParticleRows
     from npa_envs.wrappers.rsl_rl import RslRlParticleEnv as RslRlParticleEnv
     from npa_envs.wrappers.sb3 import ParticleVecEnv as ParticleVecEnv
     from npa_envs.wrappers.sb3 import RowPolicy as RowPolicy
@@ -41,7 +41,7 @@ ON_REQUEST = {
 MODULES = {
     "DamageEvents": "damage",
     "NormalizePerception": "normalize",
-    "ParticleRows": "particles_as_envs",
+    "ParticleRows": "base",
     "SpeciesTags": "species_tags",
     "TorchNormalizeObservation": "normalize",
     "TorchNormalizeReward": "normalize",

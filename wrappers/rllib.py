@@ -14,8 +14,7 @@ from npa_envs.envs import multispecies_v0, particles_v0
 from npa_envs.envs.core.vector import checked_count
 from npa_envs.errors import NPAError, importing, shown, suggest
 from npa_envs.registration import ALL, CODED, GARDEN_IDS, SPECIES_SIZES
-from npa_envs.wrappers.base import AnyVectorEnv, vector_env
-from npa_envs.wrappers.particles_as_envs import ParticleRows
+from npa_envs.wrappers.base import AnyVectorEnv, ParticleRows, vector_env
 
 with importing("Ray", "training with RLlib", "pip install 'npa-envs[rllib]'"):
     from ray.rllib.algorithms.ppo import PPOConfig

@@ -135,7 +135,14 @@ def train(
     """
     function = _checked_function(method, problem, budget, options)
     check_run_seed(seed)
-    _check_folder(method, has_folder=out is not None, needs_folder=resume or overwrite)
+    several = ProcessGroup.current().count > 1
+    if method not in KEPT_METHODS and (several or out is not None):
+        wanted = "be shared by processes" if several else "be kept in a folder (out)"
+        raise NPAError(
+            f"method {shown(method)} cannot {wanted}: take one of {', '.join(KEPT_METHODS)}"
+        )
+    if out is None and (resume or overwrite):
+        raise NPAError("resume and overwrite need a folder: give out='runs/heart'")
     settings = {"method": method, "problem": problem.to_json(), "seed": seed, "options": options}
     settings |= {"started": start is not None}
     progress = Progress(
@@ -190,17 +197,6 @@ def _checked_function(
                 f"method {shown(method)} has no option {shown(name)}: {suggest(name, known)}"
             )
     return function
-
-
-def _check_folder(method: str, *, has_folder: bool, needs_folder: bool) -> None:
-    several = ProcessGroup.current().count > 1
-    if method not in KEPT_METHODS and (several or has_folder):
-        wanted = "be shared by processes" if several else "be kept in a folder (out)"
-        raise NPAError(
-            f"method {shown(method)} cannot {wanted}: take one of {', '.join(KEPT_METHODS)}"
-        )
-    if needs_folder and not has_folder:
-        raise NPAError("resume and overwrite need a folder: give out='runs/heart'")
 
 
 def methods_for(problem: Problem) -> dict[str, str]:

@@ -341,15 +341,13 @@ class Minibatches:
         """Shuffle the samples for the next pass."""
         begin_episodes(self._random)
         for order, group_size in zip(self._orders, self._group_sizes, strict=True):
-            if isinstance(self._random, WorldRandom):
-                order.copy_(self._shuffled_by_world(self._random, group_size))
-            else:
+            if not isinstance(self._random, WorldRandom):
                 torch.randperm(len(order), generator=self._random, out=order)
-
-    def _shuffled_by_world(self, random: WorldRandom, group_size: int) -> Tensor:
-        """Return indices of a group's samples, shape [T B n], one minibatch after the other."""
-        order = random.uniform(self._steps * group_size).argsort(dim=1, stable=True)
-        world = torch.arange(self._world_count, device=order.device)[:, None]
-        step, row = order // group_size, order % group_size
-        index = (step * self._world_count + world) * group_size + row
-        return torch.cat([split.flatten() for split in index.tensor_split(self.count, dim=1)])
+                continue
+            drawn = self._random.uniform(self._steps * group_size).argsort(dim=1, stable=True)
+            world = torch.arange(self._world_count, device=order.device)[:, None]
+            step, row = drawn // group_size, drawn % group_size
+            index = (step * self._world_count + world) * group_size + row
+            # One minibatch after the other.
+            minibatches = index.tensor_split(self.count, dim=1)
+            order.copy_(torch.cat([indices.flatten() for indices in minibatches]))

@@ -7,29 +7,35 @@ The worlds of runs have the seeds `world_seeds`; the worlds of evaluations have 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from typing import Any, NamedTuple, Self
 
 import gymnasium
+import numpy as np
 import torch
+from gymnasium.spaces import Box
+from gymnasium.vector import AutoresetMode
 from torch import Tensor
 
+from npa_envs.agents.evaluation import TIME_LIMIT
 from npa_envs.agents.learning.rule_set import ClampedRule, RuleSet, species_of
-from npa_envs.agents.learning.species_env import ConcatenatedSpeciesEnv
+from npa_envs.agents.policies import spans_of
 from npa_envs.checks import check_device, check_positive, is_whole
 from npa_envs.envs.core.config import EnvConfig, Interface
 from npa_envs.envs.core.step_report import PARTICLE_REWARDS
 from npa_envs.envs.core.task import Controls, EnvTask
-from npa_envs.envs.core.vector import NPAVectorEnv
+from npa_envs.envs.core.vector import NPAVectorEnv, worlds_to_reset
 from npa_envs.envs.multi.shipped_tasks import task_settings
 from npa_envs.envs.multi.shipped_tasks import task_type as species_task_type
 from npa_envs.envs.multi.species_task import Population, SpeciesConfig, SpeciesTask
+from npa_envs.envs.multi.vector import MultiSpeciesVectorEnv
 from npa_envs.errors import NPAError, shown, suggest
 from npa_envs.registration import ALL, SPECIES_SIZES
 from npa_envs.registration import SPECIES as SPECIES_TASKS
 from npa_envs.tasks.base import ParticleTask
+from npa_envs.world.cuda_graph import to_device_async
 from npa_envs.world.environment_steps import Physics
 from npa_envs.world.particles import Particles
 from npa_envs.world.randomness import Randomness, WorldRandom
@@ -352,6 +358,104 @@ class DifferentiableTask(ParticleTask[Any]):
                 "states: compute them by torch's operations, or learn by 'ppo' or 'evolution'"
             )
         return losses
+
+
+# Worlds of several species.
+
+LEFT_WORLD = "left the world"
+"""Reason why the episode of a species ended that diverged."""
+
+
+class ConcatenatedSpeciesEnv(MultiSpeciesVectorEnv):
+    """Worlds of several species as one agent, with observations [B, N, P] and actions [B, N, A].
+
+    It has the attributes of `NPAVectorEnv` that learners need. Reward and loss of a world are means
+    over its species; a species that ended keeps its last loss. A world terminates once all of its
+    species have; its reason is that of the first one, or "left the world" if any diverged. Infos of
+    a step have for each particle, [B, N]: `particle_reward`, the reward of its species; `acted`,
+    whether its species had not ended before; `particle_terminated`, whether it terminates now.
+    """
+
+    def __init__(self, task: str, **config: Any) -> None:
+        super().__init__(task, **config)
+        self.num_envs, self.episode_steps = self.world_count, self.max_cycles
+        self.task, physics = self.worlds.task, self.worlds.physics
+        self.metadata = self.metadata | {"autoreset_mode": AutoresetMode.SAME_STEP}
+        counts, interface = self.config.agent_particle_counts, self.config.interface(physics)
+        self.spans = dict(zip(self.agents, spans_of(counts), strict=True))
+        limit, observed = physics.limits.perception, (sum(counts), interface.perception_dim)
+        self.single_observation_space = Box(-limit, limit, observed, np.float32)
+        acted = sum(counts), interface.action_dim
+        self.single_action_space = Box(-1.0, 1.0, acted, np.float32)
+        self._counts = torch.tensor(counts, device=self.worlds.device)
+        self._loss = torch.zeros(self.num_envs, len(counts), device=self.worlds.device)
+        self._reasons = np.full(self.num_envs, None, dtype=object)
+
+    @property
+    def unwrapped(self) -> ConcatenatedSpeciesEnv:
+        """The environment itself."""
+        return self
+
+    def reset(  # type: ignore[override]
+        self, *, seed: int | Sequence[int] | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Tensor, dict[str, Any]]:
+        """Start episodes as `MultiSpeciesVectorEnv.reset` does; infos have `loss`, [B]."""
+        observations, infos = super().reset(seed, options)
+        chosen = worlds_to_reset(options, self.num_envs)
+        self._reasons[chosen] = None
+        # In worlds that are not reset, infos have no loss of species that ended.
+        losses, index = self._stacked(infos, "loss"), to_device_async(chosen, self._loss.device)
+        self._loss = self._loss.index_copy(0, index, losses[index])
+        return self._concatenated(observations), {"loss": self._loss.mean(dim=1)}
+
+    def step(  # type: ignore[override]
+        self, actions: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor, dict[str, Any]]:
+        """Apply actions in [-1, 1], [B, N, A]; return observations, rewards, flags and infos."""
+        by_species = {agent: actions[:, span] for agent, span in self.spans.items()}
+        observations, *results, infos = super().step(by_species)
+        rewards, terminated, truncated = (
+            torch.stack([result[agent] for agent in self.agents], dim=1) for result in results
+        )
+        acted = self._stacked(infos, "acted")
+        self._loss = torch.where(acted, self._stacked(infos, "loss"), self._loss)
+        info: dict[str, Any] = {
+            "loss": self._loss.mean(dim=1),
+            "particle_reward": self._by_particle(rewards),
+            "acted": self._by_particle(acted),
+            "particle_terminated": self._by_particle(terminated),
+        }
+        # Why each world ends: the first reason of a species, or "left the world" of any.
+        for agent in self.agents:
+            reasons = infos[agent].get("reason")
+            if reasons is not None:
+                new = reasons != None  # noqa: E711
+                known = (self._reasons != None) & (self._reasons != TIME_LIMIT)  # noqa: E711
+                replaced = (new & ~known) | (reasons == LEFT_WORLD)
+                self._reasons = np.where(replaced, reasons, self._reasons)
+        cut, first = truncated.any(dim=1), infos[self.agents[0]]
+        over = first.get("_final_obs", torch.zeros_like(cut))
+        if "final_obs" in first:
+            last = {agent: infos[agent]["final_obs"] for agent in self.agents}
+            ended = over.cpu().numpy()
+            reasons = self._reasons.copy()
+            reasons[~ended] = self._reasons[ended] = None
+            final = {"loss": info["loss"], "_loss": over, "reason": reasons}
+            info |= {"final_obs": self._concatenated(last), "_final_obs": over}
+            info |= {"final_info": final, "_final_info": over}
+        observation, reward = self._concatenated(observations), rewards.mean(dim=1)
+        return observation, reward, over & ~cut, over & cut, info
+
+    def _concatenated(self, values: Mapping[str, Tensor]) -> Tensor:
+        return torch.cat([values[agent] for agent in self.agents], dim=1)
+
+    def _stacked(self, infos: Mapping[str, Mapping[str, Any]], name: str) -> Tensor:
+        return torch.stack([infos[agent][name] for agent in self.agents], dim=1)
+
+    def _by_particle(self, values: Tensor) -> Tensor:
+        """Repeat the values of species, [B, species], for each of their particles, [B, N]."""
+        count = self.single_action_space.shape[0]
+        return values.repeat_interleave(self._counts, dim=1, output_size=count)
 
 
 # Ids of environments, and seeds.

@@ -181,10 +181,16 @@ class Candidates:
     def _evaluate_batch(self, weights: Tensor) -> Evaluations:
         """Run candidates with weights [G, W] in one batch; return their results and last worlds."""
         snapshots, speeds = self._run(weights)
-        found = [
-            self._result_of(snapshots.map(lambda values: values[:, k]), float(speed))  # noqa: B023
-            for k, speed in enumerate(speeds)
-        ]
+        found: list[Found | None] = []
+        for k, speed in enumerate(speeds.tolist()):
+            own = Particles(snapshots.x[:, k], snapshots.s[:, k])
+            quality = float(quality_of(own))
+            # It is 0 if worlds came to rest, NaN if they diverged.
+            if quality > 0.0:
+                flat = own.map(lambda values: values.flatten(0, 1))
+                found.append(Found(quality, (speed, *self.crowding_and_mixing(flat))))
+            else:
+                found.append(None)
         return Evaluations(found, snapshots.map(lambda values: values[-1]))
 
     def _run(self, weights: Tensor) -> tuple[Particles, Tensor]:
@@ -207,14 +213,6 @@ class Candidates:
             lambda values: values[late:].view(SNAPSHOTS - late, count, -1, *values.shape[2:])
         )
         return snapshots, speeds
-
-    def _result_of(self, snapshots: Particles, speed: float) -> Found | None:
-        """Return quality and descriptors; None if worlds came to rest (0) or diverged (NaN)."""
-        quality = float(quality_of(snapshots))
-        if not quality > 0.0:
-            return None
-        worlds = snapshots.map(lambda values: values.flatten(0, 1))
-        return Found(quality, (speed, *self.crowding_and_mixing(worlds)))
 
     def crowding_and_mixing(self, worlds: Particles) -> tuple[float, float]:
         """Return `crowding` (of the mean density) and mean `mixing`; see `SearchWorld.axes`."""

@@ -81,9 +81,10 @@ def grow_and_heal(options: DemoOptions, device: torch.device) -> Iterator[str]:
     import torch
 
     from npa_envs.measure.quality import measure
-    from npa_envs.measure.wounds import LocalLoss, Wound
+    from npa_envs.measure.wounds import LocalLoss, wounded
     from npa_envs.render.world_film import WorldFilm, film_world
     from npa_envs.rule.files import load_rule
+    from npa_envs.tasks.damage import Wound
     from npa_envs.training.task_of_rule import task_for_film, task_of_rule
 
     rule = load_rule(RULE, device=device).float()
@@ -116,7 +117,7 @@ def grow_and_heal(options: DemoOptions, device: torch.device) -> Iterator[str]:
         results.append(f"  grown for {step} steps: {measure(task, *worlds[:2], step).summary}")
         for name, wound in wounds.items():
             near, began = LocalLoss(task, worlds, wound), step
-            worlds = wound.of(task, worlds)
+            worlds = wounded(task, worlds, wound)
             film.add(drawn, worlds, step, f"{wound.kind} {wound.size:g}")
             after = near(worlds)
             worlds = run(worlds, HEALING)

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import importlib
 import inspect
+import pkgutil
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Annotated
@@ -94,23 +94,24 @@ def ids() -> Iterator[str]:
     yield "  import npa_envs, then gymnasium.make(ID) or gymnasium.make_vec(ID, num_envs=8)"
     yield '  without the import: gymnasium.make("npa_envs:npa/Texture-v0")'
     yield "  Small: few particles, learned in minutes on a laptop; Large: many, for a GPU"
+
+    def line(env_id: str, steps: int | None, counts: object, cls: type) -> str:
+        """Return the line of a small or large variant with these particles, else of `cls`."""
+        text = f"the same, {counts} particles" if counts else inspect.getdoc(cls) or ""
+        return f"  {env_id:<33} {steps:>3}  {text.partition(chr(10))[0]}"
+
     order = [entry.name for entry in ALL]
     for entry in sorted(ALL, key=lambda entry: order.index(entry.name)):
-        module, _, name = entry.entry_point.partition(":")
-        summary = inspect.getdoc(getattr(importlib.import_module(module), name)) or ""
-        same = f"the same, {entry.keywords.get('particle_count')} particles"
-        text = same if entry.size else summary.partition("\n")[0]
-        yield f"  {entry.id:<33} {entry.max_episode_steps:>3}  {text}"
+        count = entry.size and entry.keywords.get("particle_count")
+        cls = pkgutil.resolve_name(entry.entry_point)
+        yield line(entry.id, entry.max_episode_steps, count, cls)
     yield "  several species: npa_envs.envs.multispecies_v0.parallel_env(ID), with PettingZoo"
     for environment, task in SPECIES.items():
-        summary = inspect.getdoc(TASKS[task]) or ""
-        steps = TASKS[task].config_type.max_cycles
-        yield f"  {environment:<33} {steps:>3}  {summary.partition(chr(10))[0]}"
-        for size in SPECIES_SIZES:
-            if size.task == task:
-                counts = size.keywords.get("particle_counts") or [size.keywords["particle_count"]]
-                text = f"the same, {' and '.join(map(str, counts))} particles"
-                yield f"  {size.id:<33} {size.max_episode_steps:>3}  {text}"
+        cls = TASKS[task]
+        yield line(environment, cls.config_type.max_cycles, None, cls)
+        for size in (size for size in SPECIES_SIZES if size.task == task):
+            counts = size.keywords.get("particle_counts") or [size.keywords["particle_count"]]
+            yield line(size.id, size.max_episode_steps, " and ".join(map(str, counts)), cls)
 
 
 def rules() -> Iterator[str]:

@@ -9,17 +9,13 @@ from pathlib import Path
 from typing import Any
 
 from npa_envs.atomic_files import write_bytes
-from npa_envs.errors import MissingDependencyError
+from npa_envs.errors import MissingDependencyError, importing
 
 
 def check_matplotlib() -> None:
     """Raise MissingDependencyError unless matplotlib is installed."""
-    try:
+    with importing("matplotlib", "a plot", "pip install 'npa-envs[bench]'"):
         import matplotlib  # noqa: F401
-    except ImportError as error:
-        raise MissingDependencyError(
-            "plots need matplotlib, which is not installed: pip install 'npa-envs[bench]'"
-        ) from error
 
 
 def write_plots(draw: Callable[[], Mapping[str, bytes]], path: Path, what: str) -> list[str]:

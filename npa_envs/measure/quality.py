@@ -16,15 +16,14 @@ from torch import Tensor
 from npa_envs.checks import check_device
 from npa_envs.errors import NPAError, shown, suggest
 from npa_envs.measure.texture_metric import TextureMetric, TextureRow
-from npa_envs.measure.wounds import WoundRow, wound_rows
+from npa_envs.measure.wounds import WoundRow, wound_rows, wounded
 from npa_envs.rule.files import shipped_rules
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.base import Task
-from npa_envs.tasks.damage import random_particle
+from npa_envs.tasks.damage import Wound, random_wound
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2D
 from npa_envs.tasks.morphogenesis3d import Morphogenesis3D
 from npa_envs.tasks.point_classification import PointClassification, majority
-from npa_envs.world.brushes import cut, wipe_state
 from npa_envs.world.particles import Particles, combined
 from npa_envs.world.randomness import Randomness, WorldRandom, normal_draws
 from npa_envs.world.rollout import rollout_particles
@@ -197,39 +196,34 @@ def healing(
             checks=sorted({max(1, heal_steps // 2), heal_steps}),
             sizes={"cut": cut_gap, "wipe": wipe_radius},
         )  # fmt: skip
-    x, s, *_ = grown
-    task = runner.task
-    before = task.metric(x, s)
+    task, x = runner.task, grown.x
+    before = task.metric(x, grown.s)
     normal = normal_draws(runner.generator, (len(x), x.shape[2]), x)
-    centre = random_particle(x, generator=runner.generator)
-    wiped = task.with_target_code(wipe_state(x, s, centre=centre, radius=wipe_radius, box=task.box))
-    slit = cut(x, s, centre=x.mean(1), normal=normal, gap=cut_gap, box=task.box)
-    damaged = {
-        f"cut, gap {cut_gap:g}": Particles(*slit),
-        f"wiped disk, radius {wipe_radius:g}": Particles(x, wiped),
+    wounds = {
+        f"cut, gap {cut_gap:g}": Wound("cut", x.mean(1), cut_gap, normal),
+        f"wiped disk, radius {wipe_radius:g}": random_wound(
+            "wipe", wipe_radius, x, runner.generator
+        ),
     }
     steps = [*range(0, heal_steps, every), heal_steps]
     rows = []
-    for name, worlds in damaged.items():
+    for name, wound in wounds.items():
+        worlds = wounded(task, Particles(x, grown.s), wound)
         losses = torch.stack([task.metric(now.x, now.s) for _, now in runner.at(steps, worlds)])
-        rows.append(_healing_row(name, before, steps, losses))
+        diverged = ~(losses[-1] <= DIVERGED_FACTOR * before)
+        mean_healed = ((losses.mean(1) <= HEALED * before.mean()) & ~diverged.all()).tolist()
+        healed = [step for step, is_healed in zip(steps, mean_healed, strict=True) if is_healed]
+        row = HealingRow(
+            damage=name,
+            before=before.mean().item(),
+            after=losses[0].mean().item(),
+            steps_to_heal=healed[0] if healed else None,
+            worlds_healed=int(((losses <= HEALED * before).any(0) & ~diverged).sum()),
+            world_count=len(before),
+            end=losses[-1].mean().item(),
+        )
+        rows.append(row)
     return rows
-
-
-def _healing_row(damage: str, before: Tensor, steps: Sequence[int], losses: Tensor) -> HealingRow:
-    """Return a row from losses [B] `before` a damage, and [len(steps), B] at `steps` after it."""
-    diverged = ~(losses[-1] <= DIVERGED_FACTOR * before)
-    mean_healed = ((losses.mean(1) <= HEALED * before.mean()) & ~diverged.all()).tolist()
-    healed = [step for step, is_healed in zip(steps, mean_healed, strict=True) if is_healed]
-    return HealingRow(
-        damage=damage,
-        before=before.mean().item(),
-        after=losses[0].mean().item(),
-        steps_to_heal=healed[0] if healed else None,
-        worlds_healed=int(((losses <= HEALED * before).any(0) & ~diverged).sum()),
-        world_count=len(before),
-        end=losses[-1].mean().item(),
-    )
 
 
 # Rules that classify clouds

@@ -206,7 +206,15 @@ class Encounters:
             for step, worlds, diverged in together:  # noqa: B007 - read after the loop
                 if step in self._frame_steps:
                     caption = f"{radius}d {distance:g}, r {ratio:g}, step {step}"
-                    frames[caption] = self._picture(worlds, distance)
+                    # Of the first world, centred between the two start positions.
+                    (frames[caption],) = draw_worlds(
+                        worlds.x[:1],
+                        worlds.s[:1],
+                        centre=(0.5 * distance, 0.0),
+                        resolution=160,
+                        pixel_size=0.5 * math.sqrt(4.0 / self.particle_count),
+                        half_width=1.2 + 0.5 * distance,
+                    )
             losses, centroids = _loss_and_centroid(first, worlds.split(counts)[0], diverged)
             alone, beside = losses_alone.mean().item(), losses.mean().item()
             change = beside / alone if alone > 0.0 else math.inf
@@ -230,18 +238,6 @@ class Encounters:
             *_, (_, worlds, diverged) = self._grow([rule], [count], 0.0, factor)
             self._alone[key] = _loss_and_centroid(rule, worlds, diverged)
         return self._alone[key]
-
-    def _picture(self, worlds: Particles, distance: float) -> NDArray[np.uint8]:
-        """Return a picture of the first world, centred between the two start positions."""
-        picture: NDArray[np.uint8] = draw_worlds(
-            worlds.x[:1],
-            worlds.s[:1],
-            centre=(0.5 * distance, 0.0),
-            resolution=160,
-            pixel_size=0.5 * math.sqrt(4.0 / self.particle_count),
-            half_width=1.2 + 0.5 * distance,
-        )[0]
-        return picture
 
     def _grow(
         self,

@@ -71,7 +71,13 @@ class TextureMetric:
         device = task.target_picture.device
         generator = torch.Generator().manual_seed(0)
         self._side = max(2, min(resolution, round(PATCH * self._scale)))
-        self._filters = _patch_filters(self._side, resolution, generator, device)
+        # Spectra of filters that project patches on random directions, [DIRECTIONS, 4, ...].
+        size = DIRECTIONS, 4, self._side, self._side
+        directions = torch.randn(size, generator=generator).double()
+        directions /= directions.flatten(1).norm(dim=1)[:, None, None, None]
+        filters = torch.zeros(DIRECTIONS, 4, resolution, resolution, dtype=torch.float64)
+        filters[..., : self._side, : self._side] = directions
+        self._filters: Tensor = torch.fft.rfft2(filters.to(device)).conj()
         bins = _wave_bins(resolution)[:, None] == torch.arange(1, 1 + BANDS * ORIENTATIONS)
         self._bins = bins.double().to(device)
         wrap = task.target.tiles
@@ -155,18 +161,6 @@ class TextureMetric:
             start, moved = start.flatten(0, 1), moved.flatten(0, 1)
             result.append(start.T @ moved / len(start))
         return torch.stack(result)
-
-
-def _patch_filters(
-    side: int, resolution: int, generator: torch.Generator, device: torch.device
-) -> Tensor:
-    """Return spectra of filters that project patches on random directions, [DIRECTIONS, 4, ...]."""
-    directions = torch.randn(DIRECTIONS, 4, side, side, generator=generator).double()
-    directions /= directions.flatten(1).norm(dim=1)[:, None, None, None]
-    filters = torch.zeros(DIRECTIONS, 4, resolution, resolution, dtype=torch.float64)
-    filters[..., :side, :side] = directions
-    spectra: Tensor = torch.fft.rfft2(filters.to(device))
-    return spectra.conj()
 
 
 def _images(pictures: Tensor) -> Tensor:

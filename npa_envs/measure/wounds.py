@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor
 
+from npa_envs.tasks.damage import Wound
 from npa_envs.tasks.morphogenesis2d import local_means
-from npa_envs.world.brushes import cut, wipe_state
 from npa_envs.world.particles import Particles
 from npa_envs.world.randomness import normal_draws
 
@@ -22,39 +22,10 @@ BATCH = 16
 """Maximum number of worlds that are drawn at once."""
 
 
-class Wound(NamedTuple):
-    """A wound in each of B worlds."""
-
-    kind: str
-    """"wipe", states of zero in a ball, "cut", a slit, or "clump", a ball drawn together."""
-    centre: Tensor
-    """Its middle [length units], shape [B, D]."""
-    size: float
-    """Radius of the ball or width of the slit [length units]."""
-    normal: Tensor | None = None
-    """Direction across a cut, shape [B, D]."""
-
-    def of(self, task: Any, worlds: Particles) -> Particles:
-        """Return grown worlds of a task with this wipe or cut."""
-        x, s, centre = worlds.x, worlds.s, self.centre
-        if self.normal is not None:
-            x, s = cut(x, s, centre=centre, normal=self.normal, gap=self.size)
-        else:
-            s = task.with_target_code(wipe_state(x, s, centre=centre, radius=self.size))
-        return worlds._replace(x=x, s=s)
-
-    def distance(self, points: Tensor) -> Tensor:
-        """Return the distance of points [B, M, D] from what it has moved or wiped, [B, M].
-
-        Inside it is negative. A cut moves what is within its width on both sides.
-        """
-        away = points - self.centre[:, None]
-        if self.normal is None:
-            length: Tensor = torch.linalg.vector_norm(away, dim=-1)
-            return length - self.size
-        across = self.normal / torch.linalg.vector_norm(self.normal, dim=-1, keepdim=True)
-        height: Tensor = (away * across[:, None]).sum(-1).abs()
-        return height - self.size
+def wounded(task: Any, worlds: Particles, wound: Wound) -> Particles:
+    """Return grown worlds of a task after a wound, with the codes of their targets."""
+    x, s = wound.inflict(worlds.x, worlds.s, task.box)
+    return worlds._replace(x=x, s=s if s is worlds.s else task.with_target_code(s))
 
 
 class LocalLoss:
@@ -139,7 +110,7 @@ def wound_rows(
         normal = normal_draws(runner.generator, centre.shape, centre) if kind == "cut" else None
         wound = Wound(kind, centre, size, normal)
         loss = LocalLoss(task, worlds, wound)
-        hurt = wound.of(task, worlds)
+        hurt = wounded(task, worlds, wound)
         after = end = loss(hurt)
         healed = changed = after > loss.bound
         for _, later in runner.at(checks, hurt):

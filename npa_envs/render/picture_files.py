@@ -162,7 +162,10 @@ def write_filmstrip(
     check_count("columns", across, ": try 4")
     across = min(across, count)
     height, width, _ = pictures[0].shape
-    font = _caption_font(texts, width)
+    # The largest font that keeps every caption within a frame's width, or the smallest.
+    fonts = map(ImageFont.load_default, range(max(12, min(28, width // 12)), 10, -1))
+    fitting = (font for font in fonts if all(font.getlength(text) <= width for text in texts))
+    font: Any = next(fitting, None) or ImageFont.load_default(10)
     _, top, _, bottom = font.getbbox("Ågjy")
     text_height = math.ceil(bottom - top) + _MARGIN if texts else 0
     cell = max([width, *(math.ceil(font.getlength(text)) for text in texts)])
@@ -184,13 +187,6 @@ def write_filmstrip(
             strip.save(temporary, format="WebP", quality=88, method=6)
         else:
             strip.save(temporary, format="PNG", optimize=True)
-
-
-def _caption_font(captions: Sequence[str], width: int) -> Any:
-    """Return the largest font that keeps every caption within `width` pixels, or the smallest."""
-    fonts = map(ImageFont.load_default, range(max(12, min(28, width // 12)), 10, -1))
-    fitting = (font for font in fonts if all(font.getlength(text) <= width for text in captions))
-    return next(fitting, None) or ImageFont.load_default(10)
 
 
 def check_rate(fps: float, *, highest: float = 1000) -> None:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from contextlib import suppress
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -78,6 +79,56 @@ def parse_damage(text: str) -> DamageEvent:
     )
 
 
+class Wound(NamedTuple):
+    """A wound in each of B worlds."""
+
+    kind: str
+    """"wipe", states of zero in a ball, "cut", a slit, or "clump", a ball drawn together."""
+    centre: Tensor
+    """Its middle [length units], shape [B, D]."""
+    size: float
+    """Radius of the ball or width of the slit [length units]."""
+    normal: Tensor | None = None
+    """Direction across a cut, shape [B, D]."""
+
+    def inflict(
+        self, x: Tensor, s: Tensor, box: Sides = None, *, factor: float = CLUMP_FACTOR
+    ) -> tuple[Tensor, Tensor]:
+        """Return wounded x and s, in a periodic box or open space; `factor` is that of `clump`."""
+        centre, size = self.centre, self.size
+        if self.normal is not None:
+            return cut(x, s, centre=centre, normal=self.normal, gap=size, box=box)
+        if self.kind == "clump":
+            return clump(x, s, centre=centre, radius=size, factor=factor, box=box)
+        return x, wipe_state(x, s, centre=centre, radius=size, box=box)
+
+    def distance(self, points: Tensor) -> Tensor:
+        """Return the distance of points [B, M, D] from what it has moved or wiped, [B, M].
+
+        Inside it is negative. A cut moves what is within its width on both sides.
+        """
+        away = points - self.centre[:, None]
+        if self.normal is None:
+            length: Tensor = torch.linalg.vector_norm(away, dim=-1)
+            return length - self.size
+        across = self.normal / torch.linalg.vector_norm(self.normal, dim=-1, keepdim=True)
+        height: Tensor = (away * across[:, None]).sum(-1).abs()
+        return height - self.size
+
+
+def random_wound(
+    kind: str, size: float, x: Tensor, generator: Randomness | None, *, anywhere: bool = False
+) -> Wound:
+    """Return a wound around a random particle of each world; a cut has a random angle.
+
+    A cut runs through the middle of the world, or with `anywhere` also through a random particle.
+    """
+    if kind != "cut":
+        return Wound(kind, random_particle(x, generator), size)
+    centre = random_particle(x, generator) if anywhere else world_mean(x)
+    return Wound(kind, centre, size, normal_draws(generator, (len(x), x.shape[2]), x))
+
+
 def damage_worlds(
     worlds: Particles,
     *,
@@ -100,15 +151,8 @@ def damage_worlds(
     if not 0 <= size <= torch.finfo(x.dtype).max:
         raise NPAError(f"the size of a damage must be finite and at least 0, got {size}: try 0.1")
     if kind == "noise":
-        x = x + size * normal_draws(generator, x.shape, x)
-    elif kind == "cut":
-        normal = normal_draws(generator, (len(x), x.shape[2]), x)
-        x, s = cut(x, s, centre=world_mean(x), normal=normal, gap=size, box=box)
-    elif kind == "clump":
-        centre = random_particle(x, generator)
-        x, s = clump(x, s, centre=centre, radius=size, factor=CLUMP_FACTOR, box=box)
-    else:
-        s = wipe_state(x, s, centre=random_particle(x, generator), radius=size, box=box)
+        return worlds._replace(x=x + size * normal_draws(generator, x.shape, x))
+    x, s = random_wound(kind, size, x, generator).inflict(x, s, box)
     return worlds._replace(x=x, s=s)
 
 

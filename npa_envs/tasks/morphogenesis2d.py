@@ -231,23 +231,18 @@ class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
             s[:, 0, LIFE] = 1.0
             return Particles(torch.zeros_like(x), s)
         if config.equivariant and max(config.seed_axis, config.seed_across) > 0.0:
-            self._write_axis(x, s, generator)
+            drawn = uniform_draws(generator, (len(x), 1), x)
+            angle = 2.0 * math.pi * (drawn if config.angles > 0 else torch.zeros_like(drawn))
+            cos, sin = angle.cos(), angle.sin()
+            along = x[..., 0] * cos + x[..., 1] * sin
+            across = x[..., 1] * cos - x[..., 0] * sin
+            s[..., 0] = config.seed_axis * along / config.seed_radius
+            if config.seed_across > 0.0:
+                s[..., 1] = config.seed_across * across / config.seed_radius
         if self._code is not None:
             blank = s.new_zeros(*s.shape[:2], len(self._code))
             s = self.with_target_code(torch.cat((blank, s), dim=-1))
         return Particles(x, s)
-
-    def _write_axis(self, x: Tensor, s: Tensor, generator: Randomness) -> None:
-        """Write to s, in place, first states that rise along an axis of each world's disk."""
-        config = self.config
-        drawn = uniform_draws(generator, (len(x), 1), x)
-        angle = 2.0 * math.pi * (drawn if config.angles > 0 else torch.zeros_like(drawn))
-        cos, sin = angle.cos(), angle.sin()
-        along = x[..., 0] * cos + x[..., 1] * sin
-        across = x[..., 1] * cos - x[..., 0] * sin
-        s[..., 0] = config.seed_axis * along / config.seed_radius
-        if config.seed_across > 0.0:
-            s[..., 1] = config.seed_across * across / config.seed_radius
 
     def with_target_code(self, s: Tensor) -> Tensor:
         """Return states with the target's code in their first channels; without codes, `s`."""

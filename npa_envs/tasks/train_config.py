@@ -217,8 +217,7 @@ class TrainConfig(Generic[TaskConfigT]):
         choices |= {"moment_inverse": MomentInverse, "dtype": Literal["float32", "float64"]}
         for name, literal in choices.items():
             check_word(self, name, get_args(literal))
-        self._check_schedule()
-        self._check_pool()
+        self._check_schedule_and_pool()
         factors, check = self.vary_eps, partial(check_field, self)
         fits = _is_pair(factors, is_real) and 0.0 < factors[0] <= factors[1]
         hint = "for example vary_eps=(0.5, 2.0)"
@@ -233,8 +232,8 @@ class TrainConfig(Generic[TaskConfigT]):
                     "set max_age_range, for example to (256, 32768)"
                 )
 
-    def _check_schedule(self) -> None:
-        check, milestones = partial(check_field, self), self.milestones
+    def _check_schedule_and_pool(self) -> None:
+        check, milestones, ages = partial(check_field, self), self.milestones, self.max_age_range
         fits = 1.0 <= self.stillness_power <= MAX_POWER
         rule = f"be at least 1 and at most {MAX_POWER:g}"
         check("stillness_power", fits, rule, "1 for arithmetic means")
@@ -249,9 +248,6 @@ class TrainConfig(Generic[TaskConfigT]):
         fits = fits and list(milestones) == sorted({m for m in milestones if m >= 1})
         rule = "be positive and increasing whole numbers in a tuple"
         check("milestones", fits, rule, "for example milestones=(2000, 4000)")
-
-    def _check_pool(self) -> None:
-        check, ages = partial(check_field, self), self.max_age_range
         fits, hint = self.world_count <= self.pool_size, f"set pool_size={self.world_count} or more"
         rule = f"be at most pool_size={self.pool_size} (batches are drawn without replacement)"
         check("world_count", fits, rule, hint)

@@ -156,7 +156,11 @@ class TrainingCycle:
         self.random = RunRandomness(
             config, device, run_generator, processes, per_world_streams=per_world_streams
         )
-        self.pool = self._make_pool()
+        indices = processes.indices(config.pool_size, self._section)
+        worlds = self._make_start_worlds(len(indices), self.random.pool)
+        self._pool_indices = indices.to(worlds.x.device)
+        ages = config.max_age_range if config.ages else None
+        self.pool = WorldPool(worlds, max_age_range=ages, indices=indices, total=config.pool_size)
         self._batch_indices = processes.indices(config.world_count).to(device)
         first_worlds = self.pool.worlds.map(lambda value: value[: len(self._batch_indices)])
         graphed = device.type == "cuda" and config.cuda_graph
@@ -185,15 +189,6 @@ class TrainingCycle:
         self._graphed_draw = graph(self._draw_worlds, generator=draws_from)
         self._graphed_store = graph(self._store_worlds)
         self._graphed_record = graph(self._record_iteration)
-
-    def _make_pool(self) -> WorldPool:
-        """Return the pool, filled with start worlds."""
-        config = self._config
-        indices = self._processes.indices(config.pool_size, self._section)
-        worlds = self._make_start_worlds(len(indices), self.random.pool)
-        self._pool_indices = indices.to(worlds.x.device)
-        ages = config.max_age_range if config.ages else None
-        return WorldPool(worlds, max_age_range=ages, indices=indices, total=config.pool_size)
 
     def run(self, number: int, least_progress: float = 0.0) -> int:
         """Train for iteration `number`, from 0 on, and return the number of its rollout's steps.

@@ -13,7 +13,6 @@ from support.small_envs import begun
 import npa_envs
 from npa_envs.agents import SpreadPolicy
 from npa_envs.agents.learning import Budget, Problem, Progress, RuleSet, method_options, train
-from npa_envs.agents.learning.progress import annealed
 from npa_envs.envs import multispecies_v0, particles_v0
 from npa_envs.errors import DivergedError
 from npa_envs.registration import ENVIRONMENTS
@@ -255,14 +254,6 @@ def test_what_is_out_of_turn_or_diverged_is_refused(rules):
     progress.advance(96)
     with pytest.raises(DivergedError, match=r"1 of \d+ in 'output.weight' of rule 0 .* after 192"):
         progress.look(rules, force=True)
-
-
-def test_learning_rates_fall_from_the_first_to_the_last():
-    rates = [annealed(2e-3, 0.1, share) for share in (0.0, 0.25, 0.5, 0.75, 1.0, 1.3)]
-    assert rates[0] == 2e-3
-    assert rates[2] == pytest.approx(1.1e-3)
-    assert rates[-1] == rates[-2] == pytest.approx(2e-4)
-    assert rates == sorted(rates, reverse=True)
 
 
 def test_options_are_named_with_their_defaults_and_lists_serve_as_ranges():

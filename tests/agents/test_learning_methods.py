@@ -19,7 +19,7 @@ from npa_envs.agents import (
     evaluate_policy,
 )
 from npa_envs.agents.learning import EVALUATION_SEEDS, Budget, Problem, RuleSet, train
-from npa_envs.agents.learning.clone import Demonstrations, unexplained_variance
+from npa_envs.agents.learning.clone import unexplained_variance
 from npa_envs.agents.learning.evolution import RuleWeights, candidates_actions, costs, fitness
 from npa_envs.agents.learning.problem import FIRST_EVALUATION_SEED, DifferentiableTask, world_seeds
 from npa_envs.agents.learning.rule_set import ClampedRule
@@ -244,16 +244,6 @@ def test_a_clone_does_what_its_teacher_does(problem, iterations, largest):
     assert abs(clone - taught) < 0.1 * abs(untaught - taught)
 
 
-def test_demonstrations_keep_the_last_worlds():
-    observation, action = torch.zeros(2, 3, 4), torch.zeros(2, 3, 2)
-    pairs = Demonstrations(5, observation, action)
-    for number in range(1, 5):
-        pairs.add(observation + number, action - number)
-        drawn, actions = pairs.draw(64, torch.Generator().manual_seed(0))
-        assert {int(k) for k in drawn[:, 0, 0]} == set(range(max(1, number - 2), number + 1))
-        assert torch.equal(drawn[:, 0, 0], -actions[:, 0, 0])
-
-
 # Nothing to learn
 
 
@@ -426,15 +416,6 @@ def test_the_fitness_of_a_population_is_that_of_one_candidate_after_the_other(pr
         assert float(returns[k]) == pytest.approx(episodes.mean_return, rel=1e-3, abs=1e-3)
         assert (episodes.steps == 1).all() == (problem is OVER)
     assert problem is OVER or float(returns.std()) > 0.01
-
-
-def test_scales_are_those_that_layers_are_drawn_with():
-    (rule,) = RuleSet.new(PROBLEMS["growth"], 0)
-    for layer in (rule.hidden, rule.output):
-        torch.nn.init.xavier_normal_(layer.weight)
-    drawn = RuleWeights([rule]).vector() / RuleWeights([rule]).scales()
-    for weights in (drawn[: rule.hidden.weight.numel()], drawn[-rule.output.weight.numel() :]):
-        assert weights.std() == pytest.approx(1.0, abs=0.2)
 
 
 def test_candidates_without_a_finite_return_are_the_worst():

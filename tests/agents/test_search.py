@@ -14,7 +14,6 @@ from npa_envs.agents.search.candidate_evaluation import (
     SEED_RADIUS,
     UPDATE_PROB,
     Candidates,
-    correlation,
     quality_of,
 )
 from npa_envs.agents.search.quality_diversity import EMITTERS, RESULTS, import_ribs
@@ -99,13 +98,6 @@ def test_quality_is_change_of_colour_less_excess():
     # Half of the coordinates are 2 beyond the bounds.
     x[..., 0] = 3.0
     assert float(quality_of(Particles(x, flicker))) == pytest.approx(0.5)
-
-
-def test_the_correlation_is_that_of_numpy_and_one_where_all_are_alike():
-    a, b = np.random.default_rng(0).standard_normal((2, 20))
-    first, second = (torch.from_numpy(v).view(1, 20, 1) for v in (a, b))
-    assert float(correlation(first, second)) == pytest.approx(np.corrcoef(a, b)[0, 1])
-    assert float(correlation(torch.ones_like(first), second)) == 1.0
 
 
 # Searches. pyribs takes seconds to import, so that but one test of it runs with the fast ones.

@@ -1,10 +1,16 @@
-"""Kernels compile for every GPU generation that is served, without a CUDA device."""
+"""Kernels compile for every GPU generation that is served, wait where they must, and are cached."""
 
+import ast
+import os
+import re
 from pathlib import Path
 
 import pytest
+import torch
 import warp as wp
+from support.processes import on_ranks
 
+import npa_envs
 from npa_envs.kernels import native_functions as native
 from npa_envs.kernels.cuda.adjoint import listed_adjoint
 from npa_envs.kernels.cuda.density import listed_density, tiled_density
@@ -25,7 +31,8 @@ from npa_envs.kernels.pictures.blending import block_kernels
 from npa_envs.kernels.pictures.pixel_errors import gather_errors
 from npa_envs.kernels.portable.rewards_and_ends import update_episodes
 from npa_envs.ops import warmup
-from npa_envs.ops.launch import loaded_modules
+from npa_envs.ops.launch import launch, loaded_modules
+from npa_envs.runtime import start_warp
 
 VARIANTS = {
     "sort": lambda: sort_small_worlds(3, 1024),
@@ -104,3 +111,101 @@ def test_portable_kernels_compile_for_turing(tmp_path):
 def test_cuda_kernels_compile_from_ampere_on(capability, tmp_path):
     for kernel in VARIANTS.values():
         compile_for(kernel().module, capability, tmp_path)
+
+
+# The cache, shared by processes that start together.
+
+
+@wp.kernel(module="unique")
+def double(values: wp.array(dtype=wp.float32)):
+    values[wp.tid()] *= 2.0
+
+
+def compile_and_launch():
+    """Return how many modules this process compiles for a launch, and the launch's results."""
+    compile_module, compiled = wp.Module._compile, []
+
+    def counted(*arguments, **options):
+        compiled.append(compile_module(*arguments, **options))
+        return compiled[-1]
+
+    wp.Module._compile = counted
+    values = torch.ones(3)
+    launch(double, 3, torch.device("cpu"), values)
+    return sum(map(bool, compiled)), values.tolist()
+
+
+@pytest.mark.skipif(os.name != "posix", reason="needs locks of files and fork")
+def test_of_four_processes_that_start_together_one_compiles(tmp_path, monkeypatch):
+    start_warp()
+    cache = tmp_path / "cache"
+    cache.mkdir()
+    monkeypatch.setattr(wp.config, "kernel_cache_dir", str(cache))
+    results = on_ranks(4, compile_and_launch, tmp_path)
+    assert sorted(results) == [(count, [2.0, 2.0, 2.0]) for count in (0, 0, 0, 1)]
+    assert len(list(cache.glob("*.lock"))) == 1
+
+
+def test_a_cache_without_room_for_locks_is_used_all_the_same(tmp_path, monkeypatch):
+    start_warp()
+    monkeypatch.setattr(wp.config, "kernel_cache_dir", str(tmp_path / "nowhere" / "yet"))
+
+    @wp.kernel(module="unique")
+    def triple(values: wp.array(dtype=wp.float32)):
+        values[wp.tid()] *= 3.0
+
+    values = torch.ones(2)
+    launch(triple, 2, torch.device("cpu"), values)
+    assert values.tolist() == [3.0, 3.0]
+
+
+# Kernels that are launched early wait for those before them; nothing is run, no GPU is needed.
+
+
+WAIT = "wait_for_previous_kernel()"
+
+KERNELS = Path(npa_envs.__file__).parent / "kernels"
+
+GLOBAL_ACCESS = re.compile(r"\b(?:ld|st|atom|red|cp|prefetch)\.(?!param|shared|local)\S+")
+"""An instruction of PTX that may touch the device's memory."""
+
+
+def kernel_bodies():
+    """Yield each kernel's name and its statements after the docstring."""
+    for path in sorted(KERNELS.rglob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            marks = [ast.unparse(mark) for mark in getattr(node, "decorator_list", ())]
+            if isinstance(node, ast.FunctionDef) and any("wp.kernel" in mark for mark in marks):
+                yield f"{path.stem}.{node.name}", node.body[1:]
+
+
+def test_kernels_that_wait_do_so_first():
+    for name, body in kernel_bodies():
+        first, *others = map(ast.unparse, body)
+        assert WAIT not in "".join(others), name
+        assert WAIT not in first or first == WAIT, name
+
+
+def test_no_load_may_be_moved_ahead_of_the_wait():
+    for path in KERNELS.rglob("*.cuh"):
+        code = re.sub(r"//.*", "", path.read_text(encoding="utf-8"))
+        # Both promise that nobody writes what is read while the kernel is there.
+        assert not re.search(r"__ldg|ld\.global\.nc|__restrict__", code), path.name
+
+
+@pytest.mark.parametrize(("capability", "waits"), [(80, False), (90, True)])
+def test_memory_is_touched_after_the_wait(capability, waits, tmp_path):
+    module = two_layer_kernel(1, 1, "relu_store_mask").module
+    wp.compile_aot_module(module, arch=capability, module_dir=tmp_path, use_ptx=True)
+    (file,) = tmp_path.glob("*.ptx")
+    assert "ld.global.nc" not in file.read_text(encoding="utf-8")
+    entries = re.findall(r"\.entry \w+\(.*?\n\}\n", file.read_text(encoding="utf-8"), re.DOTALL)
+    assert entries
+    for entry in entries:
+        # Blocks of instructions, of which the first is entered first.
+        first, *blocks = re.split(r"\n\$L\w+:\n", entry)
+        waiting = [block for block in (first, *blocks) if "griddepcontrol.wait;" in block]
+        assert len(waiting) == waits
+        assert any(map(GLOBAL_ACCESS.search, blocks))
+        for block in {first, *waiting}:
+            assert not (waits and GLOBAL_ACCESS.search(block.partition("griddepcontrol.wait;")[0]))

@@ -63,12 +63,6 @@ def test_a_commands_folders_are_not_told():
     assert records.command_text("stress", words, "--out", "--output") == text
 
 
-def test_a_time_limit_passes_once_and_never_without_one():
-    assert not records.time_limit(None)()
-    assert not records.time_limit(60.0)()
-    assert records.time_limit(0.0)()
-
-
 def test_stored_records_can_be_read():
     """Those of robustness are read by the test that their tables are the stored ones."""
     from npa_envs.measure.accuracy.check_runner import StressRecord

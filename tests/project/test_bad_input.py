@@ -1,4 +1,4 @@
-"""What the operators and the dynamics reject, and what they say."""
+"""What the operators, the dynamics and errors reject, and what they say."""
 
 import gymnasium
 import numpy as np
@@ -20,6 +20,7 @@ from npa_envs import (
 from npa_envs.agents.learning import Budget, Problem
 from npa_envs.agents.learning import train as learn
 from npa_envs.envs import multispecies_v0
+from npa_envs.errors import shown, suggest
 from npa_envs.measure.quality import scores
 from npa_envs.ops import orbit, periodic_splat, splat, warmup
 from npa_envs.render import write_gif
@@ -183,3 +184,45 @@ WIDE = NPARule(state_dim=2)
 def test_what_else_is_rejected_is_a_clear_error(call, message):
     with pytest.raises(NPAError, match=message):
         call()
+
+
+# Errors name what came in a few words, never a whole tensor, and suggest the nearest name.
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [
+        (torch.zeros(64, 3), "a float32 tensor of shape (64, 3)"),
+        (np.zeros((3, 4)), "a float64 array of shape (3, 4)"),
+        (torch.zeros(3, 2).tolist(), "3 x 2 numbers"),
+        ([torch.zeros(9), 1], "[a float32 tensor of shape (9,), 1]"),
+        (torch.zeros(2, device="meta"), "a float32 tensor of shape (2,)"),
+        (torch.tensor([1.0, 2.0]), "tensor([1., 2.])"),
+        ((0.5, 0.5), "(0.5, 0.5)"),
+        (torch.Tensor, "<class 'torch.Tensor'>"),
+    ],
+)
+def test_of_many_numbers_an_error_shows_the_shape(value, text):
+    assert shown(value) == text
+
+
+@pytest.mark.parametrize(
+    ("name", "known", "nearest"),
+    [
+        ("morphogenesis", ["co_morphogenesis2d", "morphogenesis3d", "morphogenesis2d"], 2),
+        ("morph", ["co_morphogenesis2d", "morphogenesis3d", "morphogenesis2d"], 2),
+        ("GEKO", ["heart", "gecko"], 1),
+        ("num_particles", ["particle_count", "position_noise", "species_count"], 0),
+        ("target", ["stretch", "state_dim"], None),
+        ("lizard", ["gecko", "heart"], None),
+        (None, ["gecko"], None),
+    ],
+)
+def test_an_unknown_name_is_answered_by_the_nearest_known_one(name, known, nearest):
+    hint = "" if nearest is None else f"did you mean {known[nearest]!r}? "
+    assert suggest(name, known) == f"{hint}known: {', '.join(sorted(known))}"
+
+
+def test_an_error_lists_at_most_forty_known_names():
+    text = suggest("a", [f"name{number:03}" for number in range(100)])
+    assert text.endswith("name039 and 60 more")

@@ -8,8 +8,25 @@ from support.circle_task import CircleTask, plain_rollout
 from support.worlds import tensors
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from npa_envs.training import JsonlLog, Trainer
+from npa_envs.tasks.morphogenesis2d import Morphogenesis2D
+from npa_envs.training import JsonlLog, Trainer, preset
 from npa_envs.training.cycle import TrainingCycle
+from npa_envs.world.particles import Particles
+
+
+def heart_task(**fields):
+    sizes = {"resolution": 64, "particle_count": 512, "target_point_count": 512}
+    return Morphogenesis2D(preset("tiny", target="heart", **sizes, **fields).task)
+
+
+def grown(task, world_count, noise):
+    """Worlds that are the target but for a little noise, in another place, as rules grow it."""
+    points, colours = task.target.points, task.target.colours
+    drawn = torch.randn(points.shape, generator=torch.Generator().manual_seed(3))
+    x = (points + noise * drawn + torch.tensor([0.2, -0.1])).expand(world_count, -1, -1).clone()
+    s = x.new_zeros(*x.shape[:2], task.config.state_dim)
+    s[..., -3:] = colours - 0.5
+    return Particles(x, s)
 
 
 def trainer_of(config, task=None, **options):

@@ -1,6 +1,5 @@
 """Pool, optimiser, iteration and loss statistics, each by itself."""
 
-import itertools
 import math
 
 import pytest
@@ -23,49 +22,6 @@ from npa_envs.world.particles import Particles
 def make_pool(device="cpu"):
     x = torch.arange(6.0, device=device)[:, None, None].repeat(1, 4, 2)
     return WorldPool(Particles(x, x[..., :1].repeat(1, 1, 3)))
-
-
-def test_pool_draws_different_worlds_and_all_of_them_in_the_long_run():
-    pool = make_pool()
-    generator = torch.Generator().manual_seed(0)
-    counts = torch.zeros(6)
-    for _ in range(300):
-        index = pool.sample(4, generator)
-        assert len(set(index.tolist())) == 4
-        counts[index] += 1
-    # Each count is hypergeometric with mean 200 and standard deviation 8.2.
-    assert (counts - 200).abs().max() < 41
-    # What is read is a copy.
-    x, s, *_ = pool.worlds.take(torch.tensor([4, 2]))
-    assert x[:, 0, 0].tolist() == [4, 2]
-    x.zero_()
-    s.zero_()
-    assert (pool.worlds.x[4, 0, 0], pool.worlds.s[2, 0, 0]) == (4, 2)
-
-
-def test_a_pool_with_lifetimes_draws_one_world_of_each_section():
-    x = torch.zeros(12, 2, 2)
-    pool = WorldPool(Particles(x, x.clone()), max_age_range=(10, 1000))
-    lifetimes = pool.lifetime.tolist()
-    assert (lifetimes[0], lifetimes[-1]) == (10, 1000)
-    ratios = [b / a for a, b in itertools.pairwise(lifetimes)]
-    assert ratios == pytest.approx([100 ** (1 / 11)] * 11, rel=0.03)
-    generator = torch.Generator().manual_seed(0)
-    drawn = torch.stack([pool.sample_sections(4, generator) for _ in range(60)])
-    assert (drawn // 3 == torch.arange(4)).all()
-    assert set(drawn.flatten().tolist()) == set(range(12))
-
-
-def test_worlds_age_and_are_new_when_they_run_away():
-    x = torch.zeros(4, 2, 2)
-    pool = WorldPool(Particles(x, x.clone()), max_age_range=(5, 40))
-    index = torch.tensor([0, 2, 3])
-    after = torch.tensor([0.0, 0.0, 30.0])[:, None, None].expand(3, 2, 2)
-    pool.write(index, Particles(after, after), Particles(x[:3], x[:3]), age=torch.tensor([7, 8, 9]))
-    assert pool.age.tolist() == [7, 0, 8, 0]
-    age, over = pool.ages_of(index)
-    assert age.tolist() == [7, 8, 0]
-    assert over.tolist() == [True, False, False]
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf, 11.0, -11.0])
@@ -227,17 +183,6 @@ def test_worlds_that_do_not_move_have_finite_gradients_of_stillness(tmp_path, po
     assert all(gradient.isfinite().all() for gradient in iteration.gradients)
 
 
-def test_a_parameter_outside_the_loss_gets_a_zero_gradient(tmp_path):
-    task, rule, iteration = make_iteration(circle_config(tmp_path))
-    rule.unused = nn.Parameter(torch.ones(2))
-    iteration = EagerIteration(
-        task, rule, circle_config(tmp_path), iteration.start, torch.Generator(), plain_rollout
-    )
-    rule.unused.grad.fill_(5.0)
-    iteration.run(2)
-    assert rule.unused.grad.tolist() == [0.0, 0.0]
-
-
 def test_statistics_are_the_means_of_the_interval(tmp_path, device):
     _, _, iteration = make_iteration(circle_config(tmp_path), device=device)
     statistics, resumed = LossStatistics(iteration), LossStatistics(iteration)
@@ -268,24 +213,6 @@ def test_worlds_and_masks_are_drawn_independently(tmp_path):
     cpu, config = torch.device("cpu"), circle_config(tmp_path)
     drawn = RunRandomness(config, cpu, schedule, ALONE, per_world_streams=False)
     assert torch.rand(4, generator=drawn.worlds).ne(torch.rand(4, generator=drawn.masks)).all()
-
-
-def test_the_snapshot_is_of_the_first_bad_iteration_and_not_of_a_later_one(tmp_path, device):
-    _, _, iteration = make_iteration(circle_config(tmp_path), device=device)
-    statistics = LossStatistics(iteration)
-    for number, (term, mark) in enumerate([(1.0, 10.0), (math.nan, 20.0), (math.inf, 30.0)], 1):
-        iteration.terms.fill_(1.0)
-        iteration.terms[2] = term
-        iteration.start.x.fill_(mark)
-        statistics.begin(number, 100 + number)
-        statistics.add(torch.tensor([False], device=device))
-        statistics.send()
-        assert statistics.receive()[1] == (number == 1) == statistics.all_finite()
-    snapshot = statistics.snapshot()
-    assert (snapshot["iteration"], snapshot["steps"]) == (2, 102)
-    assert math.isnan(snapshot["terms"]["state"])
-    assert snapshot["terms"]["distance"] == 1.0
-    assert snapshot["x0"].unique().tolist() == [20.0]
 
 
 @pytest.mark.parametrize(

@@ -74,19 +74,6 @@ def events(monkeypatch):
     return seen
 
 
-def test_a_capture_follows_its_warm_up_and_collects_nothing(events, monkeypatch):
-    monkeypatch.setattr(gc, "collect", lambda *_args: events.append("collect"))
-    capture(
-        lambda: events.append(f"run, collecting {gc.isenabled()}"), CUDA,
-        pool="memory", generator="dice", warm_up=lambda: events.append("warm up"),
-    )  # fmt: skip
-    assert gc.isenabled()
-    enter = ["side waits for current", "enter side"]
-    captured = ["register dice", "begin memory thread_local", "run, collecting False", "end"]
-    warmed = [*enter, "warm up", "leave side", "synchronize", "empty"]
-    assert events == [*warmed, *enter, *captured, "leave side", "current waits for side"]
-
-
 @pytest.mark.parametrize("broken", [True, False])
 def test_a_failed_capture_is_ended_and_tells_its_own_reason(events, broken):
     def function():

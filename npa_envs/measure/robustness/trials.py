@@ -18,14 +18,13 @@ from torch import Tensor
 from npa_envs.errors import NPAError
 from npa_envs.measure.accuracy.trained_rule_checks import MIN_VIEWS, task_name
 from npa_envs.measure.quality import RuleRunner
-from npa_envs.measure.wounds import LocalLoss, Wound
-from npa_envs.ops import world_mean
+from npa_envs.measure.wounds import LocalLoss
 from npa_envs.rule.files import load_rule
 from npa_envs.rule.rule import NPARule
-from npa_envs.tasks.damage import DAMAGE_SIZES, random_particle
+from npa_envs.tasks.damage import DAMAGE_SIZES, Wound, random_wound
 from npa_envs.tasks.seeds import uniform_ball, uniform_box
 from npa_envs.training.task_of_rule import task_of_rule, tasks_of_codes
-from npa_envs.world.brushes import clump, cut, nearest_image, offsets_from, wipe_state
+from npa_envs.world.brushes import nearest_image, offsets_from
 from npa_envs.world.divergence import divergence
 from npa_envs.world.particles import Particles, combined
 from npa_envs.world.randomness import StreamId, WorldRandom
@@ -307,15 +306,10 @@ class RuleTrial:
 
         Rules of one picture or object have wounds; of the others whole worlds are compared.
         """
-        if not self.task.grows_picture or len(self._tasks[self.particle_count]) > 1:
+        several = len(self._tasks[self.particle_count]) > 1
+        if several or not self.task.grows_picture or damage not in ("wipe", "cut", "clump"):
             return None
-        random = self.random(StreamId.DAMAGE)
-        if damage == "cut":
-            normal = random.normal(x.shape[2], dtype=x.dtype)
-            return Wound(damage, world_mean(x), DAMAGE_SIZES[damage], normal)
-        if damage in ("wipe", "clump"):
-            return Wound(damage, random_particle(x, random), DAMAGE_SIZES[damage])
-        return None
+        return random_wound(damage, DAMAGE_SIZES[damage], x, self.random(StreamId.DAMAGE))
 
     def by_seed(self, losses: Tensor) -> Tensor:
         """Return the mean loss of each seed's worlds, [..., seeds], of losses [..., B]."""
@@ -342,31 +336,20 @@ class Damage(NamedTuple):
     """Whether it removes half of the particles."""
 
 
-def wipe(x: Tensor, s: Tensor, random: WorldRandom, box: Box) -> tuple[Tensor, Tensor]:
-    """Return x, and s with zero states in a disk around a random particle, in 3D in a ball."""
-    centre = random_particle(x, random)
-    return x, wipe_state(x, s, centre=centre, radius=DAMAGE_SIZES["wipe"], box=box)
-
-
-def slit(x: Tensor, s: Tensor, random: WorldRandom, box: Box) -> tuple[Tensor, Tensor]:
-    """Return x cut at a random angle through the centroid (a random particle if periodic) and s."""
-    centre = world_mean(x) if box is None else random_particle(x, random)
-    normal = random.normal(x.shape[2], dtype=x.dtype)
-    change = partial(cut, normal=normal, gap=DAMAGE_SIZES["cut"])
-    return _around(x, s, centre, box, change)
-
-
-def pull_together(x: Tensor, s: Tensor, random: WorldRandom, box: Box) -> tuple[Tensor, Tensor]:
-    """Return x, where all particles in a disk around a random one moved to its position, and s."""
-    change = partial(clump, radius=DAMAGE_SIZES["clump"], factor=1.0)
-    return _around(x, s, random_particle(x, random), box, change)
-
-
-def _around(
-    x: Tensor, s: Tensor, centre: Tensor, box: Box, change: Callable[..., tuple[Tensor, Tensor]]
+def inflict(
+    kind: str, x: Tensor, s: Tensor, random: WorldRandom, box: Box
 ) -> tuple[Tensor, Tensor]:
-    """Return x and s, changed by `change` in coordinates whose origin is `centre`, [B, D]."""
-    away, s = change(offsets_from(x, centre, box), s, centre=torch.zeros_like(centre))
+    """Return x and s with a wound; a clump's particles all move to its centre.
+
+    In a periodic box cuts run through a random particle.
+    """
+    wound = random_wound(kind, DAMAGE_SIZES[kind], x, random, anywhere=box is not None)
+    if kind == "wipe":
+        return wound.inflict(x, s, box)
+    # In coordinates whose origin is the wound.
+    centre, origin = wound.centre, torch.zeros_like(wound.centre)
+    away = offsets_from(x, centre, box)
+    away, s = wound._replace(centre=origin).inflict(away, s, factor=1.0)
     return nearest_image(away + centre[:, None], box), s
 
 
@@ -393,9 +376,9 @@ def _lowest_half(x: Tensor, s: Tensor, key: Tensor) -> tuple[Tensor, Tensor]:
 
 
 DAMAGES = {
-    "wipe": Damage(wipe, static=True),
-    "cut": Damage(slit, static=False),
-    "clump": Damage(pull_together, static=False),
+    "wipe": Damage(partial(inflict, "wipe"), static=True),
+    "cut": Damage(partial(inflict, "cut"), static=False),
+    "clump": Damage(partial(inflict, "clump"), static=False),
     "noise": Damage(add_state_noise, static=True),
     "half": Damage(remove_half, static=True, halves=True),
     "side": Damage(remove_side, static=True, halves=True),

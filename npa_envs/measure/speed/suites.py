@@ -162,21 +162,17 @@ class ScalingRow:
 
 def scaling_rows(session: TimingSession) -> list[ScalingRow]:
     """Return a row for each value of each of `AXES`; values increase."""
-    return session.rows(
-        (f"{value} {axis}", partial(_scaling_row, session, axis, value))
-        for axis, values in _axis_values(session).items()
-        for value in values
-    )
-
-
-def _axis_values(session: TimingSession) -> dict[str, Sequence[int]]:
     if session.small:
         values: tuple[Sequence[int], ...] = (256, 1024), (16, 64), (1, 2), (4, 16)
     else:
         powers, worlds = (range(10, 21), 8) if session.cuda else (range(8, 17), 5)
         neighbours, channels = (8, 16, 32, 64, 128, 256), (4, 8, 16, 32, 64)
         values = [2**k for k in powers], neighbours, [2**k for k in range(worlds)], channels
-    return dict(zip(AXES, values, strict=True))
+    return session.rows(
+        (f"{value} {axis}", partial(_scaling_row, session, axis, value))
+        for axis, axis_values in zip(AXES, values, strict=True)
+        for value in axis_values
+    )
 
 
 def varied(axis: str, value: int, *, small: bool = False) -> Workload:
