@@ -149,13 +149,6 @@ def test_only_the_servers_own_page_with_its_token_may_upload_and_download(held):
     assert client_of(Training(held._folder))[1].get("/training/x/page.html").status_code == 404
 
 
-def test_a_server_without_training_takes_no_files(tmp_path):
-    site = server.Site(lambda: None, films=tmp_path)
-    client = testclient.TestClient(server.make_app(site), base_url=HERE)
-    assert client.post("/training", content=b"1").status_code == 403
-    assert client.get("/training/x/rule.safetensors").status_code == 403
-
-
 def test_what_is_to_grow_is_written_as_a_picture_of_limited_size(tmp_path):
     (tmp_path / "dropped").write_bytes(png(size=(1600, 800)))
     read_dropped(tmp_path / "dropped")
