@@ -333,7 +333,10 @@ class ViewerSession:
         due = clock()
         while not self._stopped.is_set() and self._next_world is None:
             changed |= self._apply_messages(world, wait=not (world.playing or changed))
-            self._report_training()
+            training = self._site.training
+            if training is not None and training.report is not self._reported:
+                self._reported = training.report
+                self._send_event(self._reported)
             with self._site.exclusive:
                 events = world.take_events()
             for event in events:
@@ -345,7 +348,6 @@ class ViewerSession:
             if not self._free_frames.acquire(timeout=0.25):
                 continue
             self._stopped.wait(max(0.0, due - clock()))
-            training = self._site.training
             slow = training is not None and training.slows_worlds
             seconds = LEARNING_FRAME_SECONDS if slow else FRAME_SECONDS
             due = max(due, clock() - seconds) + seconds
@@ -361,12 +363,6 @@ class ViewerSession:
                 self._send_error(f"{error}; the world is paused")
                 self._send_event(world.describe())
             changed = False
-
-    def _report_training(self) -> None:
-        training = self._site.training
-        if training is not None and training.report is not self._reported:
-            self._reported = training.report
-            self._send_event(self._reported)
 
     def _training_action(self, action: Any, world: LiveWorld) -> None:
         training = self._site.training

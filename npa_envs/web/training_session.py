@@ -121,10 +121,8 @@ class Training:
         if run_id != report.get("id") or not report.get("has_rule"):
             return None
         rule = RunFolder(Path(report["folder"])).rule
-        if name == rule.name:
-            return rule
         if name != "page.html":
-            return None
+            return rule if name == rule.name else None
         shown_rule = page_rule(str(rule))
         title = report["name"]
         shown_rule |= {"name": title, "world": shown_rule["world"] | {"title": title, "note": ""}}
