@@ -123,8 +123,8 @@ class Site:
         """Return why a request, or the socket of a page, is refused; None: it is answered."""
         host = asked.headers.get("host", "")
         # The name without port and brackets.
-        closed = host.startswith("[")
-        name = host[1:].partition("]")[0] if closed else host.partition(":")[0].lower()
+        in_brackets = host.startswith("[")
+        name = host[1:].partition("]")[0] if in_brackets else host.partition(":")[0].lower()
         # With a token, any name is allowed: the token protects enough.
         named = self.token is not None or name in (self.host, "localhost", "127.0.0.1", "::1")
         if not name or not named:
@@ -134,7 +134,8 @@ class Site:
         if asked.scope.get("method") != "GET" and asked.headers.get("origin") not in own:
             return "this server takes messages and files only from its own page"
         given = asked.query_params.get("token", "").encode()
-        public = self.token is None or asked.url.path.endswith((".js", ".css"))
+        # Not the path of `asked.url`, which a forged host can change.
+        public = self.token is None or asked.scope["path"].endswith((".js", ".css"))
         if not public and not secrets.compare_digest(given, str(self.token).encode()):
             return "open the link that npa-envs view has printed: it holds the token"
         return None

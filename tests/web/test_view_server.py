@@ -171,6 +171,7 @@ def test_a_server_that_others_reach_asks_for_a_token(tmp_path):
     client = client_of(site, "http://lab.example:8765")
     for path in ("/", "/?token=wrong", "/films/film.mp4?token=é"):
         assert client.get(path).status_code == 403
+        assert client.get(path, headers={"host": "lab/page.js?"}).status_code == 403
     assert client.get(f"/?token={site.token}").status_code == 200
     for address in (THERE, f"{THERE}?token=", f"{THERE}?token=wrong"):
         refuse(client, address)
