@@ -197,6 +197,7 @@ class Training:
                     self._look(folder)
             finally:
                 # It may save; after some time it is killed.
+                assert process.stdin is not None, "it was opened as a pipe"
                 process.stdin.close()
                 with contextlib.suppress(subprocess.TimeoutExpired):
                     process.wait(PARENT_GRACE + 2.0)

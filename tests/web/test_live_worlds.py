@@ -220,7 +220,10 @@ def test_a_brush_changes_states_or_positions_where_it_is(world):
     ):  # fmt: skip
         x, s, *_ = world.particles
         assert not world.handle(brush(name, **fields))
-        changed = [(a != b).any(dim=-1)[0] for a, b in zip((x, s), world.particles[:2], strict=True)]
+        changed = [
+            (before != after).any(dim=-1)[0]
+            for before, after in zip((x, s), world.particles[:2], strict=True)
+        ]
         moves = name in ("push", "clump", "noise", "cut")
         assert 0 < int(changed[not moves].sum()) < COUNT
         assert not changed[moves].any()
