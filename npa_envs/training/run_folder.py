@@ -206,7 +206,7 @@ class RunFolder:
         self.lock = path / ".lock"
         """Locked while a trainer writes to the folder; names the trainer's process and computer."""
         self._files = (self.log, self.rule, self.diagnosis, self.checkpoint, self.config)
-        self._known: tuple[int, int] | None = None
+        self._known: tuple[int, ...] | None = None
 
     def prepare(self, byte_count: int, *, pictures: bool = True) -> None:
         """Create the folder; NPAError without room for two checkpoints of `byte_count` bytes."""
@@ -256,7 +256,7 @@ class RunFolder:
                     ) from None
                 except OSError:
                     pass  # The file system has no locks.
-            if self._known != _identity(self.checkpoint):
+            if self._known != file_version(self.checkpoint):
                 raise NPAError(
                     "out must be a folder that no other run writes to, but another one has written "
                     f"{str(self.checkpoint)!r} meanwhile: resume it, or choose another folder"
@@ -269,7 +269,7 @@ class RunFolder:
 
     def note_checkpoint(self) -> None:
         """Remember which checkpoint file there is, so that `locked` notices another trainer's."""
-        self._known = _identity(self.checkpoint)
+        self._known = file_version(self.checkpoint)
 
     def tidy(self) -> None:
         """Remove temporary files that interrupted writes have left."""
@@ -292,13 +292,13 @@ class RunFolder:
         return self.path / f"rule-{species}.safetensors"
 
 
-def _identity(path: Path) -> tuple[int, int] | None:
-    """Return inode and time of a file, which change when it is replaced, or None if missing."""
+def file_version(path: Path) -> tuple[int, ...] | None:
+    """Return inode, size and time of a file, which change when it is written; None if missing."""
     try:
         status = path.stat()
     except OSError:
         return None
-    return status.st_ino, status.st_mtime_ns
+    return status.st_ino, status.st_size, status.st_mtime_ns
 
 
 class JsonlLog:

@@ -20,7 +20,7 @@ from npa_envs.tasks.co_morphogenesis2d import CoMorphogenesis2DConfig, together
 from npa_envs.tasks.damage import DAMAGE_SIZES
 from npa_envs.tasks.seeds import uniform_ball
 from npa_envs.tasks.train_config import TrainConfig
-from npa_envs.training.run_folder import JsonlLog, RunFolder
+from npa_envs.training.run_folder import JsonlLog, RunFolder, file_version
 from npa_envs.training.task_of_rule import TrainedTask, task_of_rule, trained_config
 from npa_envs.training.task_table import load_config, preset
 from npa_envs.web.live_world import ColouredWorld, Colouring, LiveWorld, shows_of
@@ -434,7 +434,7 @@ class RunWorld(RuleWorld):
             config = load_config(self._run_folder.config, joint)
             self._centres = list(config.task.centres)
         self._each = None if particle_count is None else max(1, particle_count // len(files))
-        self._written = [_version(path) for path in files]
+        self._written = [file_version(path) for path in files]
         self._iteration = 0
         self._poll_due = 0.0
         choices = {name: str(path) for name, path in self._files.items()}
@@ -489,7 +489,7 @@ class RunWorld(RuleWorld):
 
     def _poll(self) -> None:
         logged = self._read_log()
-        written = [_version(path) for path in self._files.values()]
+        written = [file_version(path) for path in self._files.values()]
         if written != self._written:
             # Set before reading, so that an error is reported only once.
             self._written = written
@@ -501,7 +501,7 @@ class RunWorld(RuleWorld):
     def _read_log(self) -> bool:
         """Read the log if it has changed, and return whether it has new records."""
         path, shown_points = self._run_folder.log, self._points
-        version = _version(path)
+        version = file_version(path)
         if version == self._log_version:
             return False
         self._log_version = version
@@ -548,15 +548,6 @@ class RunWorld(RuleWorld):
             config = trained_config(path, metadata).task if "config" in metadata else None
             identities.append((rule.hyper_parameters(), metadata.get("task"), config))
         return identities
-
-
-def _version(path: Path) -> tuple[int, ...] | None:
-    """Return numbers that change when a file is written, or None if there is no file."""
-    try:
-        status = path.stat()
-    except FileNotFoundError:
-        return None
-    return status.st_ino, status.st_size, status.st_mtime_ns
 
 
 def rules_of_run(folder: RunFolder) -> list[Path]:

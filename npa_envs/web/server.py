@@ -42,7 +42,7 @@ try:
     from starlette.concurrency import run_in_threadpool
     from starlette.middleware import Middleware
     from starlette.middleware.base import BaseHTTPMiddleware, RequestResponseEndpoint
-    from starlette.requests import Request
+    from starlette.requests import HTTPConnection, Request
     from starlette.responses import FileResponse, JSONResponse, PlainTextResponse, Response
     from starlette.routing import Route, WebSocketRoute
     from starlette.websockets import WebSocket, WebSocketDisconnect
@@ -119,30 +119,26 @@ class Site:
         """The context in which a world runs."""
         self.session_count = 0
 
-    def allows_host(self, host: str) -> bool:
-        """Return whether a request's `Host` is a name of this server."""
+    def refusal(self, asked: HTTPConnection) -> str | None:
+        """Return why a request, or the socket of a page, is refused; None: it is answered."""
+        host = asked.headers.get("host", "")
         # The name without port and brackets.
-        closed = host.startswith("[")
-        name = host[1:].partition("]")[0] if closed else host.partition(":")[0].lower()
-        if self.token is not None:
-            # With a token, any name is allowed: the token protects enough.
-            return bool(name)
-        return name == self.host or name in ("localhost", "127.0.0.1", "::1")
-
-    def allows_origin(self, origin: str | None, host: str) -> bool:
-        """Return whether a page of an origin may change something; None: it is no page."""
-        return origin in (None, f"http://{host}", f"https://{host}")
-
-    @property
-    def frame_seconds(self) -> float:
-        """Minimum time between two frames of a world now [s]."""
-        slow = self.training is not None and self.training.slows_worlds
-        return LEARNING_FRAME_SECONDS if slow else FRAME_SECONDS
-
-    def allows_token(self, token: str | None) -> bool:
-        """Return whether the token is right, or none is required."""
-        given = (token or "").encode()
-        return self.token is None or secrets.compare_digest(given, self.token.encode())
+        in_brackets = host.startswith("[")
+        name = host[1:].partition("]")[0] if in_brackets else host.partition(":")[0].lower()
+        # With a token, any name is allowed: the token protects enough.
+        named = self.token is not None or name in (self.host, "localhost", "127.0.0.1", "::1")
+        if not name or not named:
+            return f"ask for {self.host}, got {shown(host)}"
+        # Without an origin it is no page; a form of another page always has one.
+        own = (None, f"http://{host}", f"https://{host}")
+        if asked.scope.get("method") != "GET" and asked.headers.get("origin") not in own:
+            return "this server takes messages and files only from its own page"
+        given = asked.query_params.get("token", "").encode()
+        # Not the path of `asked.url`, which a forged host can change.
+        public = self.token is None or asked.scope["path"].endswith((".js", ".css"))
+        if not public and not secrets.compare_digest(given, str(self.token).encode()):
+            return "open the link that npa-envs view has printed: it holds the token"
+        return None
 
 
 def is_loopback(host: str) -> bool:
@@ -155,57 +151,9 @@ def is_loopback(host: str) -> bool:
 def make_app(site: Site) -> Starlette:
     """Return the application that serves a site."""
 
-    async def page(request: Request) -> Response:
-        if not site.allows_token(request.query_params.get("token")):
-            return _refused("open the link that npa-envs view has printed: it holds the token")
-        return FileResponse(PAGE / "index.html")
-
-    async def page_file(request: Request) -> Response:
-        return _file_response(PAGE, request, {".js": "text/javascript", ".css": "text/css"})
-
-    async def film(request: Request) -> Response:
-        if not site.allows_token(request.query_params.get("token")):
-            return _refused("films need the token of the page")
-        return _file_response(site.films, request, {".gif": "image/gif", ".mp4": "video/mp4"})
-
-    async def upload(request: Request) -> Response:
-        """Begin a training of the body; keywords are those of `Training.begin`."""
-        query, headers = request.query_params, request.headers
-        if site.training is None or not site.allows_token(query.get("token")):
-            return _refused("files are learned by pages of this server, with its token")
-        # Without an origin it is no page; a form of another page always has one.
-        if not site.allows_origin(headers.get("origin"), headers.get("host", "")):
-            return _refused("files are learned from the server's own page")
-        content = bytearray()
-        async for part in request.stream():
-            content += part
-            if len(content) > MAX_BYTES:
-                break
-        options = {word: word in query for word in ("emoji", "whole")}
-        name = query.get("name", "")
-        try:
-            begun = await run_in_threadpool(site.training.begin, name, bytes(content), **options)
-        except (NPAError, OSError) as error:
-            return PlainTextResponse(str(error), 409 if site.training.active else 400)
-        return JSONResponse({"id": begun})
-
-    def learned_file(request: Request) -> Response:
-        if site.training is None or not site.allows_token(request.query_params.get("token")):
-            return _refused("rules need the token of the page")
-        try:
-            path = site.training.file(request.path_params["id"], request.path_params["name"])
-        except NPAError as error:
-            return PlainTextResponse(str(error), 400)
-        if path is None:
-            return PlainTextResponse("no such file", 404)
-        return FileResponse(path, media_type="application/octet-stream", filename=path.name)
-
     async def connect(page: WebSocket) -> None:
-        host, origin = page.headers.get("host", ""), page.headers.get("origin")
-        if not site.allows_host(host) or not site.allows_origin(origin, host):
-            return await page.close(1008, "this server answers only its own page")
-        if not site.allows_token(page.query_params.get("token")):
-            return await page.close(1008, "the token is missing or wrong")
+        if (reason := site.refusal(page)) is not None:
+            return await page.close(1008, reason)
         await page.accept()
         if site.session_count >= MAX_SESSIONS:
             return await page.close(1013, f"{MAX_SESSIONS} worlds are open: close a page")
@@ -216,26 +164,26 @@ def make_app(site: Site) -> Starlette:
             site.session_count -= 1
 
     async def guard(request: Request, call_next: RequestResponseEndpoint) -> Response:
-        host = request.headers.get("host", "")
-        if site.allows_host(host):
+        if (reason := site.refusal(request)) is None:
             response = await call_next(request)
         else:
-            response = _refused(f"ask for {site.host}, got {shown(host)}")
+            response = PlainTextResponse(f"refused: {reason}", 403)
         response.headers.update(SECURITY)
         return response
 
+    films = {".gif": "image/gif", ".mp4": "video/mp4"}
+    parts = {".js": "text/javascript", ".css": "text/css"}
     routes = [
-        Route("/", page),
+        Route("/", lambda request: FileResponse(PAGE / "index.html")),
         WebSocketRoute("/socket", connect),
-        Route("/films/{name}", film),
-        Route("/training", upload, methods=["POST"]),
-        Route("/training/{id}/{name}", learned_file),
-        Route("/{name}", page_file),
+        Route("/films/{name}", functools.partial(_file_response, site.films, films)),
+        *([] if site.training is None else training_routes(site.training)),
+        Route("/{name}", functools.partial(_file_response, PAGE, parts)),
     ]
     return Starlette(routes=routes, middleware=[Middleware(BaseHTTPMiddleware, dispatch=guard)])
 
 
-def _file_response(folder: Path, request: Request, media_types: Mapping[str, str]) -> Response:
+def _file_response(folder: Path, media_types: Mapping[str, str], request: Request) -> Response:
     path = folder / request.path_params["name"]
     with contextlib.suppress(OSError, ValueError):  # Invalid file names.
         if path.parent == folder and path.suffix in media_types and path.is_file():
@@ -243,8 +191,37 @@ def _file_response(folder: Path, request: Request, media_types: Mapping[str, str
     return PlainTextResponse("no such file", 404)
 
 
-def _refused(reason: str) -> Response:
-    return PlainTextResponse(f"refused: {reason}", 403)
+def training_routes(training: Training) -> list[Route]:
+    """Return the routes by which pages give what is to be learned, and get what was."""
+
+    async def upload(request: Request) -> Response:
+        """Begin a training of the body; keywords are those of `Training.begin`."""
+        query, content = request.query_params, bytearray()
+        async for part in request.stream():
+            content += part
+            if len(content) > MAX_BYTES:
+                break
+        options = {word: word in query for word in ("emoji", "whole")}
+        name = query.get("name", "")
+        try:
+            begun = await run_in_threadpool(training.begin, name, bytes(content), **options)
+        except (NPAError, OSError) as error:
+            return PlainTextResponse(str(error), 409 if training.active else 400)
+        return JSONResponse({"id": begun})
+
+    def download(request: Request) -> Response:
+        try:
+            path = training.file(request.path_params["id"], request.path_params["name"])
+        except NPAError as error:
+            return PlainTextResponse(str(error), 400)
+        if path is None:
+            return PlainTextResponse("no such file", 404)
+        return FileResponse(path, media_type="application/octet-stream", filename=path.name)
+
+    return [
+        Route("/training", upload, methods=["POST"]),
+        Route("/training/{id}/{name}", download),
+    ]
 
 
 def frame_bytes(frame: FrameEvent) -> bytes:
@@ -268,7 +245,7 @@ class ViewerSession:
         self._outbox: asyncio.Queue[bytes | str] = asyncio.Queue(MESSAGES_KEPT)
         self._free_frames = threading.BoundedSemaphore(FRAMES_AHEAD)
         self._stopped = threading.Event()
-        self._next_world: Callable[[], LiveWorld] | None = None
+        self._next_world: Callable[[], LiveWorld] | None = site.make_world
         self._pictures: list[bytes] | None = None
         """The pictures of the film, while one is made."""
         self._reported: Any = None
@@ -333,15 +310,15 @@ class ViewerSession:
             self._loop.call_soon_threadsafe(put)
 
     def _world_thread(self) -> None:
-        make: Callable[[], LiveWorld] | None = self._site.make_world
-        while make is not None and not self._stopped.is_set():
+        while (make := self._next_world) is not None and not self._stopped.is_set():
+            self._next_world = None
             try:
                 with self._site.exclusive:
                     world = make()
             except NPAError as error:
                 return self._send_error(str(error))
             try:
-                make = self._run_world(world)
+                self._run_world(world)
             except Exception as error:
                 # A bug or a failed device: shown on the page, and raised for the log.
                 self._send_error(f"the world has ended: {shown(error)}")
@@ -349,16 +326,18 @@ class ViewerSession:
             finally:
                 world.close()
 
-    def _run_world(self, world: LiveWorld) -> Callable[[], LiveWorld] | None:
-        """Run a world until another one is wanted; return what makes that, None at the end."""
+    def _run_world(self, world: LiveWorld) -> None:
+        """Run a world until another one is wanted, or to the end."""
         self._send_event(world.describe())
-        self._next_world = None
         changed = True
         clock = self._loop.time
         due = clock()
         while not self._stopped.is_set() and self._next_world is None:
             changed |= self._apply_messages(world, wait=not (world.playing or changed))
-            self._report_training()
+            training = self._site.training
+            if training is not None and training.report is not self._reported:
+                self._reported = training.report
+                self._send_event(self._reported)
             with self._site.exclusive:
                 events = world.take_events()
             for event in events:
@@ -370,7 +349,8 @@ class ViewerSession:
             if not self._free_frames.acquire(timeout=0.25):
                 continue
             self._stopped.wait(max(0.0, due - clock()))
-            seconds = self._site.frame_seconds
+            slow = training is not None and training.slows_worlds
+            seconds = LEARNING_FRAME_SECONDS if slow else FRAME_SECONDS
             due = max(due, clock() - seconds) + seconds
             try:
                 with self._site.exclusive:
@@ -384,13 +364,6 @@ class ViewerSession:
                 self._send_error(f"{error}; the world is paused")
                 self._send_event(world.describe())
             changed = False
-        return self._next_world
-
-    def _report_training(self) -> None:
-        training = self._site.training
-        if training is not None and training.report is not self._reported:
-            self._reported = training.report
-            self._send_event(self._reported)
 
     def _training_action(self, action: Any, world: LiveWorld) -> None:
         training = self._site.training

@@ -20,6 +20,7 @@ from torch import Tensor
 from npa_envs.atomic_files import made_folder, read_json, write_bytes
 from npa_envs.errors import NPAError
 from npa_envs.measure.quality import psnr
+from npa_envs.render import to_uint8
 from npa_envs.tasks.base import Task
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2D
 from npa_envs.tasks.morphogenesis3d import Morphogenesis3D
@@ -52,17 +53,13 @@ class Training:
         self._lock = threading.Lock()
         self._stopping = threading.Event()
         self._thread: threading.Thread | None = None
-        self._report: TrainingEvent = {"type": "training", "state": "none", "limit": MAX_BYTES}
-
-    @property
-    def report(self) -> TrainingEvent:
+        self.report: TrainingEvent = {"type": "training", "state": "none", "limit": MAX_BYTES}
         """The event for pages; a new object after each change."""
-        return self._report
 
     @property
     def active(self) -> bool:
         """Whether a file is being read or learned."""
-        return self._report["state"] in ("reading", "starting", "learning")
+        return self.report["state"] in ("reading", "starting", "learning")
 
     @property
     def slows_worlds(self) -> bool:
@@ -80,7 +77,7 @@ class Training:
         with self._lock:
             if self.active:
                 raise NPAError(
-                    f"one file is learned at a time, and {self._report['name']} still is: stop it "
+                    f"one file is learned at a time, and {self.report['name']} still is: stop it "
                     "first, or wait for its end"
                 )
             if not 0 < len(content) <= MAX_BYTES:
@@ -94,7 +91,7 @@ class Training:
             with made_folder(run):
                 write_bytes(stored, content)
             self._stopping.clear()
-            self._report = {
+            self.report = {
                 "type": "training", "state": "reading", "limit": MAX_BYTES, "id": run.name,
                 "name": shown_name, "folder": str(run), "note": "", "has_rule": False,
             }  # fmt: skip
@@ -120,14 +117,12 @@ class Training:
         None: there is no such run, or it has no rule yet. Raises NPAError if the rule cannot run
         in a page.
         """
-        report = self._report
+        report = self.report
         if run_id != report.get("id") or not report.get("has_rule"):
             return None
         rule = RunFolder(Path(report["folder"])).rule
-        if name == rule.name:
-            return rule
         if name != "page.html":
-            return None
+            return rule if name == rule.name else None
         shown_rule = page_rule(str(rule))
         title = report["name"]
         shown_rule |= {"name": title, "world": shown_rule["world"] | {"title": title, "note": ""}}
@@ -136,19 +131,19 @@ class Training:
         return path
 
     def _set(self, **fields: Any) -> None:
-        report: Any = self._report | fields
-        if report != self._report:
-            self._report = report
+        report: Any = self.report | fields
+        if report != self.report:
+            self.report = report
 
     def _run(self, stored: Path, whole: bool) -> None:
         try:
             self._read_and_learn(stored, whole)
         except Exception as error:
-            message = str(error).replace(str(stored), self._report["name"])
+            message = str(error).replace(str(stored), self.report["name"])
             if "keep_background" in message and not whole:
                 self._set(cure="whole")
             self._set(state="failed", message=message)
-        if not self._report["has_rule"]:
+        if not self.report["has_rule"]:
             shutil.rmtree(stored.parent, ignore_errors=True)
 
     def _read_and_learn(self, stored: Path, whole: bool) -> None:
@@ -186,22 +181,27 @@ class Training:
         Raises NPAError, which calls it `what`, if it fails or takes longer than `seconds`.
         """
         path = folder / "output.txt"
-        with path.open("wb") as file:
-            process = subprocess.Popen(
-                [sys.executable, "-m", *words],
-                stdin=subprocess.PIPE, stdout=file, stderr=subprocess.STDOUT,
-                env=os.environ | {PARENT_PIPE: "1", "PYTHONIOENCODING": "utf-8"},
-                # Ctrl-C is for the server, which then stops the training.
-                start_new_session=True,
-            )  # fmt: skip
+        options: dict[str, Any] = {
+            "stdin": subprocess.PIPE, "stderr": subprocess.STDOUT,
+            "env": os.environ | {PARENT_PIPE: "1", "PYTHONIOENCODING": "utf-8"},
+            # Ctrl-C is for the server, which then stops the training.
+            "start_new_session": True,
+        }  # fmt: skip
+        command = [sys.executable, "-m", *words]
         begun = time.monotonic()
-        try:
-            while process.poll() is None and not self._stopping.wait(0.25):
-                if seconds is not None and time.monotonic() > begun + seconds:
-                    raise NPAError(f"{what} must take at most {seconds} s: give a smaller file")
-                self._look(folder)
-        finally:
-            end_process(process)
+        with path.open("wb") as file, subprocess.Popen(command, stdout=file, **options) as process:
+            try:
+                while process.poll() is None and not self._stopping.wait(0.25):
+                    if seconds is not None and time.monotonic() > begun + seconds:
+                        raise NPAError(f"{what} must take at most {seconds} s: give a smaller file")
+                    self._look(folder)
+            finally:
+                # It may save; after some time it is killed.
+                assert process.stdin is not None, "it was opened as a pipe"
+                process.stdin.close()
+                with contextlib.suppress(subprocess.TimeoutExpired):
+                    process.wait(PARENT_GRACE + 2.0)
+                process.kill()
         output = path.read_text("utf-8", errors="replace")
         if process.returncode and not self._stopping.is_set():
             _, found, error = output.rpartition("npa-envs: error: ")
@@ -218,7 +218,7 @@ class Training:
         run = RunFolder(folder)
         if not run.rule.exists():
             return
-        if not self._report["has_rule"]:
+        if not self.report["has_rule"]:
             config = read_json(run.config)
             total = config["iterations"] * config["repeats"]
             self._set(state="learning", has_rule=True, iteration=0, total=total)
@@ -230,19 +230,8 @@ class Training:
                 self._set(**{name: last[name] for name in ("iteration", "loss", "seconds")})
             if len(records) > 1:
                 done, seconds = (last[name] - first[name] for name in ("iteration", "seconds"))
-                left = self._report["total"] - last["iteration"]
+                left = self.report["total"] - last["iteration"]
                 self._set(seconds_left=round(seconds / done * left, 1))
-
-
-def end_process(process: subprocess.Popen[bytes]) -> None:
-    """End a process that watches its parent: it may save; after some time it is killed."""
-    assert process.stdin is not None, "it was opened as a pipe"
-    process.stdin.close()
-    try:
-        process.wait(PARENT_GRACE + 2.0)
-    except subprocess.TimeoutExpired:
-        process.kill()
-        process.wait()
 
 
 # The world of a training.
@@ -309,7 +298,5 @@ def psnr_on_white(task: Task, x: Tensor, s: Tensor) -> Tensor:
     config = replace(flat.config, resolution=WHITE_SIDE)
     fine = Morphogenesis2D(config, target=flat.target, device=x.device)
     pictures = torch.cat((fine.picture(x, s), fine.target_picture[None]))
-    # Where spots overlap, densities exceed 1, and colours are means.
-    rgb = pictures[..., :3] / pictures[..., 3:].clamp_min(1.0)
-    rgb = rgb + 1.0 - pictures[..., 3:].clamp(0.0, 1.0)
+    rgb = torch.from_numpy(to_uint8(pictures)) / 255.0
     return psnr(rgb[:-1], rgb[-1:]).mean()

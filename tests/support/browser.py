@@ -44,7 +44,9 @@ class Page:
     def __init__(self, address: str) -> None:
         connect = pytest.importorskip("websockets.sync.client").connect
         self._open = contextlib.ExitStack()
-        self._socket = self._open.enter_context(connect(address, max_size=2**28, open_timeout=120))
+        self._socket = self._open.enter_context(
+            connect(address, max_size=2**28, max_queue=None, open_timeout=120)
+        )
         self._numbers = itertools.count(1)
         self.complaints: list[str] = []
         """What the page wrote to the console as warnings and errors, and what it failed to load;

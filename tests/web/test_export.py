@@ -310,6 +310,11 @@ def test_read_outs_have_the_colours_of_the_viewer(run, name):
     if name == "digits":
         pytest.importorskip("sklearn")
     rule = page_rule(name) if name == "digits" else page_rule(name, particle_count=300)
+    if name == "digits":
+        # Each class begins as a cloud of its own.
+        clouds = rule["world"]["seed"]["clouds"]
+        assert (len(clouds), len(set(clouds)), rule["world"]["count"]) == (10, 10, 512)
+        assert "count" not in rule["world"]["settings"]
     result = live(run, settings_of(rule), *[ADVANCE] * 6)
     count = len(result["species"])
     s = unpacked(result["s"], (1, count, -1))
@@ -319,15 +324,6 @@ def test_read_outs_have_the_colours_of_the_viewer(run, name):
     got = torch.tensor(last(result, "frame")["colours"]).view(count, 3)
     assert float((own[0].clamp(0, 1) * 255.0 - got).abs().max()) <= 1.0
     assert len(got.unique(dim=0)) > 20
-
-
-@pytest.mark.slow
-def test_each_class_of_digits_begins_as_a_cloud_of_its_own(run):
-    pytest.importorskip("sklearn")
-    world = page_rule("digits")["world"]
-    clouds = world["seed"]["clouds"]
-    assert (len(clouds), len(set(clouds)), world["count"]) == (10, 10, 512)
-    assert "count" not in world["settings"]
 
 
 # The file.
@@ -361,10 +357,8 @@ def test_an_import_or_export_of_another_form_is_refused(tmp_path, monkeypatch):
     (tmp_path / "a.js").write_text(known)
     assert 'modules["a.js"] = (() => {\nconst {\n  b,\n} = modules[' in joined_modules("a.js")
     for line in (
-        *(f'import {names} from "./b.js";' for names in ("c", "* as c", "{ b as c }")),
-        'import "./b.js";', 'await import("./b.js");', 'import { b } from "./b.js"',
-        *(f"export {form};" for form in ("{ b }", "default 1", "let c = 1", "function* c() {}")),
-        "  export const c = 1;",
+        'import * as c from "./b.js";', 'import "./b.js";', 'await import("./b.js");',
+        'import { b } from "./b.js"', "export { b };", "export default 1;", "  export const c = 1;",
     ):  # fmt: skip
         (tmp_path / "a.js").write_text(f"{known}{line}\n")
         with pytest.raises(ValueError, match=r"in line 5 of .*a\.js"):

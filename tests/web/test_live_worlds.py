@@ -93,40 +93,29 @@ def test_what_is_shown_does_not_change_the_world(gecko):
     for show in ("mask", "speed", "density", "components", "species", "state 3"):
         put(watched, show=show)
         for world in (plain, watched):
-            put(world, speed=2)
+            put(world, speed=2, update_prob=0.25)
             world.advance()
-        assert watched.frame().colours.shape == (COUNT, 3)
+        colours = watched.frame().colours
+        assert colours.shape == (COUNT, 3)
+        if show == "mask":
+            # Four standard deviations of a share of the draws.
+            assert abs((colours[:, 0] > 200).mean() - 0.25) < 0.18
         assert torch.equal(plain.particles.x, watched.particles.x)
         assert torch.equal(plain.particles.s, watched.particles.s)
 
 
-def test_the_mask_shows_about_as_many_as_are_updated(device):
-    world = RuleWorld("gecko", device=device, particle_count=1024)
-    put(world, update_prob=0.25, show="mask")
-    advance(world, 3)
-    bright = (world.frame().colours[:, 0] > 200).mean()
-    # Four standard deviations of a share of 1024 draws.
-    assert abs(bright - 0.25) < 0.06
-
-
-def test_play_and_step(world):
+def test_play_step_and_reset(world):
     assert world.playing
+    first = world.frame().positions.copy()
     world.handle({"type": "step"})
-    assert not world.playing
-    assert world.frame().step == 1
+    assert (world.playing, world.frame().step) == (False, 1)
     world.handle({"type": "play", "on": True})
     assert world.playing
-
-
-def test_the_same_seed_gives_the_same_world_and_the_next_one_another(world):
-    first = world.frame().positions.copy()
-    world.advance()
     world.handle({"type": "reset", "seed": 0})
     np.testing.assert_array_equal(world.frame().positions, first)
     world.handle({"type": "reset"})
-    assert world.describe()["seed"] == 1
+    assert (world.describe()["seed"], world.frame().step) == (1, 0)
     assert not np.array_equal(world.frame().positions, first)
-    assert world.frame().step == 0
 
 
 def test_remove_takes_particles_and_the_others_feel_it_nearby_only(world, gecko):
@@ -223,29 +212,22 @@ def test_what_is_added_to_a_world_of_a_rule_with_codes_carries_one(device):
     assert torch.equal(world.particles.s[0, :, :8], code.expand(world.particles.s.shape[1], 8))
 
 
-def test_wipe_sets_states_to_zero_and_keeps_particles(world):
+def test_a_brush_changes_states_or_positions_where_it_is(world):
     advance(world, 8)
-    x, s, *_ = world.particles
-    inside = x[0].norm(dim=-1) <= 0.1
-    world.handle(brush("wipe"))
-    assert torch.equal(world.particles.x, x)
-    assert torch.equal(world.particles.s[0, ~inside], s[0, ~inside])
-    assert 0 < int(inside.sum()) < COUNT
-    assert float(world.particles.s[0, inside].abs().max()) == 0.0
-
-
-def test_push_carries_particles_along_and_clump_and_cut_move_them(world):
-    before = world.particles.x.clone()
-    world.handle(brush("push", move=[0.05, 0.0], radius=0.2, strength=1.0))
-    moved = world.particles.x - before
-    assert float(moved[..., 0].max()) > 0.03
-    assert float(moved[..., 0].min()) >= 0.0
-    assert float(moved[..., 1].abs().max()) == 0.0
-    before = world.particles.x.clone()
-    world.handle(brush("clump", radius=0.3, strength=1.0))
-    assert world.particles.x.norm(dim=-1).mean() < before.norm(dim=-1).mean()
-    world.handle(brush("cut", at=[-1.0, 0.0], move=[2.0, 0.0], radius=0.05))
-    assert float(world.particles.x[..., 1].abs().min()) >= 0.025 - 1e-6
+    for name, fields in (
+        ("wipe", {}), ("inject", {"source": [0.2, 0.0]}), ("push", {"move": [0.05, 0.0]}),
+        ("clump", {}), ("noise", {}), ("cut", {"move": [0.1, 0.0], "radius": 0.05}),
+    ):  # fmt: skip
+        x, s, *_ = world.particles
+        assert not world.handle(brush(name, **fields))
+        changed = [
+            (before != after).any(dim=-1)[0]
+            for before, after in zip((x, s), world.particles[:2], strict=True)
+        ]
+        moves = name in ("push", "clump", "noise", "cut")
+        assert 0 < int(changed[not moves].sum()) < COUNT
+        assert not changed[moves].any()
+        assert float(x[0, changed[not moves]].norm(dim=-1).max()) < 0.15
 
 
 def test_grafts_follow_the_other_rule(world):
@@ -430,20 +412,17 @@ def test_zero_is_grey_and_signs_are_opposite():
     assert high[0] > high[2] + 0.2
 
 
-def test_components_do_not_flip_from_frame_to_frame():
+def test_components_do_not_flip_and_leave_out_particles_that_are_no_number():
     colouring = Colouring()
     first = colours_of("components", colouring)
     later = colours_of("components", colouring, s=S * torch.tensor([1.0, 1, 1.01, 1, 1, 1]))
     assert np.abs(first - later).max() < 30
     assert first.std() > 20
-
-
-def test_particles_that_are_no_number_leave_the_components_of_the_others_alone():
     s = torch.cat((S, S[:, :2]), dim=1)
     s[0, 50, 1], s[0, 51, 2] = float("nan"), float("inf")
     colouring = Colouring()
     broken = colours_of("components", colouring, x=torch.cat((X, X[:, :2]), dim=1), s=s)
-    np.testing.assert_array_equal(broken[:50], colours_of("components"))
+    np.testing.assert_array_equal(broken[:50], first)
     # A world of nothing else is not remembered.
     colours_of("components", colouring, s=torch.full_like(S, float("nan")))
     assert colours_of("components", colouring).std() > 20

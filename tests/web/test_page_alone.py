@@ -117,26 +117,20 @@ def test_all_that_a_page_shows_has_a_meaning(run):
     assert len(set(meanings)) == len(shows) - 2
 
 
-def test_loading_is_shown_until_the_first_frame_of_a_world(run):
-    states = run("""
+def test_loading_is_shown_until_the_first_frame_and_the_key_f_shows_the_whole_world(run):
+    states, centre, zoom = run("""
         const hidden = () => element("loading").hidden;
         const states = [hidden()];
-        listen(frame(1));
+        listen(frame(1, [4, 0, 6, 2]));
         tick();
         states.push(hidden());
-        listen({ ...world, half_width: 2 });
-        return [...states, hidden()];
-    """)
-    assert states == [False, True, False]
-
-
-def test_the_key_f_shows_the_whole_world(run):
-    centre, zoom = run("""
-        listen(frame(1, [4, 0, 6, 2]));
         page.camera.zoom = 9;
         page.controls.key({ key: "f", target: { matches: () => false }, preventDefault() {} });
-        return [page.camera.centre, page.camera.zoom];
+        const { centre, zoom } = page.camera;
+        listen({ ...world, half_width: 2 });
+        return [[...states, hidden()], centre, zoom];
     """)
+    assert states == [False, True, False]
     assert centre == [5, 1, 0]
     assert math.isclose(zoom, 1.1 / 1.15)
 

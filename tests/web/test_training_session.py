@@ -21,6 +21,7 @@ from PIL import Image
 from support.browser import DESK
 
 from npa_envs import NPAError, load_rule, save_rule
+from npa_envs.rule.files import rule_metadata, shipped_rules
 from npa_envs.training import preset
 from npa_envs.training.task_table import TASKS
 from npa_envs.web import dropped_file, training_session
@@ -80,6 +81,12 @@ def wait_until(condition, seconds=300.0):
         assert time.monotonic() < end, "never true"
         time.sleep(0.05)
     return value
+
+
+def ended(training) -> dict:
+    """The report of a training at its end."""
+    wait_until(lambda: not training.active)
+    return training.report
 
 
 def processes_of(folder: Path) -> list[str]:
@@ -149,13 +156,6 @@ def test_only_the_servers_own_page_with_its_token_may_upload_and_download(held):
     assert client_of(Training(held._folder))[1].get("/training/x/page.html").status_code == 404
 
 
-def test_a_server_without_training_takes_no_files(tmp_path):
-    site = server.Site(lambda: None, films=tmp_path)
-    client = testclient.TestClient(server.make_app(site), base_url=HERE)
-    assert client.post("/training", content=b"1").status_code == 403
-    assert client.get("/training/x/rule.safetensors").status_code == 403
-
-
 def test_what_is_to_grow_is_written_as_a_picture_of_limited_size(tmp_path):
     (tmp_path / "dropped").write_bytes(png(size=(1600, 800)))
     read_dropped(tmp_path / "dropped")
@@ -213,10 +213,9 @@ def test_the_psnr_of_the_target_itself_is_the_largest_and_a_blank_worlds_is_low(
 
 
 def test_an_old_world_begins_again_with_a_later_rule_and_once_more_at_the_end(tmp_path):
-    config = preset("tiny", target="heart")
-    metadata = {"task": "morphogenesis2d", "config": json.dumps(_stored(config))}
-    task = TASKS["morphogenesis2d"].make(config.task, CPU)
-    rule = task.make_rule(torch.Generator().manual_seed(0))
+    rule = load_rule("heart")
+    metadata = rule_metadata(shipped_rules()["heart"])
+    metadata = {name: metadata[name] for name in ("task", "config")}
     save_rule(rule, tmp_path / "rule.safetensors", metadata=metadata)
     training = Training(tmp_path)
     training._set(state="learning", id="x", name="heart.png", folder=str(tmp_path), has_rule=True)
@@ -238,20 +237,13 @@ def test_an_old_world_begins_again_with_a_later_rule_and_once_more_at_the_end(tm
     assert world.step == 5
 
 
-def _stored(config):
-    from npa_envs.training import config_to_dict
-
-    return {k: v for k, v in config_to_dict(config).items() if k not in ("out", "device")}
-
-
 # With processes.
 
 
 def test_the_page_hears_in_words_what_the_child_refuses(tmp_path):
     training = Training(tmp_path)
     training.begin("holiday.jpg", png(noise=True))
-    wait_until(lambda: not training.active)
-    report = training.report
+    report = ended(training)
     assert (report["state"], report["cure"]) == ("failed", "whole")
     assert "holiday.jpg" in report["message"]
     assert str(tmp_path) not in report["message"]
@@ -264,8 +256,7 @@ def test_a_file_whose_reading_takes_too_long_or_too_much_memory_is_refused(tmp_p
     monkeypatch.setattr(training_session, "READ_SECONDS", 0.1)
     training = Training(tmp_path)
     training.begin("a.png", png())
-    wait_until(lambda: not training.active)
-    assert "must take at most 0.1 s" in training.report["message"]
+    assert "must take at most 0.1 s" in ended(training)["message"]
     wait_until(lambda: processes_of(tmp_path) == [])
     if sys.platform == "linux":
         code = (
@@ -279,8 +270,7 @@ def test_a_file_whose_reading_takes_too_long_or_too_much_memory_is_refused(tmp_p
 def test_a_dropped_picture_is_learned_and_offered(tmp_path):
     training = Training(tmp_path, preset="tiny")
     run_id = training.begin("red <disk>.png", png())
-    wait_until(lambda: not training.active)
-    report = training.report
+    report = ended(training)
     assert (report["state"], report["iteration"], report["total"]) == ("done", 40, 40)
     assert report["loss"] > 0
     rule = load_rule(training.file(run_id, "rule.safetensors"))
@@ -306,8 +296,7 @@ def test_a_stopped_training_keeps_its_rule_and_no_process(tmp_path):
     wait_until(lambda: training.report.get("iteration", 0) >= 10)
     assert processes_of(tmp_path)
     training.stop()
-    wait_until(lambda: not training.active, 60)
-    assert training.report["state"] == "stopped"
+    assert ended(training)["state"] == "stopped"
     wait_until(lambda: processes_of(tmp_path) == [], 60)
     assert load_rule(training.file(training.report["id"], "rule.safetensors")).state_dim == 16
 

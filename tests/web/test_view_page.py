@@ -164,7 +164,7 @@ def test_a_recording_yields_a_film_and_a_snapshot_a_picture(shown, tmp_path):
     page.call("Browser.setDownloadBehavior", behavior="allow", downloadPath=str(tmp_path))
     click(page, "record")
     step = page.run(f"{FRAME}.step")
-    page.wait(f"{FRAME}.step > {step + 12}")
+    page.wait(f"{FRAME}.step > {step + 24}")
     click(page, "record")
     page.wait("document.querySelectorAll('#files a').length === 2", 60)
     (film,) = (tmp_path / "films").glob("*.gif")

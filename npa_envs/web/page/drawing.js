@@ -133,28 +133,22 @@ function tiles(scene, width, height) {
   return range(width, box[0], camera.centre[0]).flatMap((x) => rows.map((y) => [x, y, 0]));
 }
 
-const PROJECT = `
+// Particles, and the ends of trails, whose only colour is how opaque they are.
+const SPOT_VERTEX = `#version 300 es
+layout(location=0) in vec3 position;
+layout(location=1) in vec3 colour;
 uniform vec3 right, up, toward, centre, offset;
 uniform vec2 unit;        // device units a length unit
 uniform float distance_;  // of the camera; 0: no perspective
 uniform float nearest;    // nearness that counts as the front
 uniform float covered;    // fraction of the height that controls cover
-vec4 project(vec3 position, out float scale, out float near) {
-  vec3 p = position + offset - centre;
-  near = dot(p, toward);
-  scale = distance_ > 0.0 ? distance_ / max(distance_ - near, 1e-3) : 1.0;
-  return vec4(dot(p, right) * scale * unit.x, dot(p, up) * scale * unit.y + covered, -near / nearest, 1.0);
-}`;
-
-const SPOT_VERTEX = `#version 300 es
-layout(location=0) in vec3 position;
-layout(location=1) in vec3 colour;
 uniform float size;       // pixels at the depth of the centre
 out vec3 tint; out float light;
-${PROJECT}
 void main() {
-  float scale, near;
-  gl_Position = project(position, scale, near);
+  vec3 p = position + offset - centre;
+  float near = dot(p, toward);
+  float scale = distance_ > 0.0 ? distance_ / max(distance_ - near, 1e-3) : 1.0;
+  gl_Position = vec4(dot(p, right) * scale * unit.x, dot(p, up) * scale * unit.y + covered, -near / nearest, 1.0);
   gl_PointSize = size * scale;
   tint = colour;
   light = distance_ > 0.0 ? clamp(0.95 + 0.5 * near / nearest, 0.45, 1.15) : 1.0;
@@ -204,21 +198,10 @@ void main() {
   }
 }`;
 
-const TRAIL_VERTEX = `#version 300 es
-layout(location=0) in vec3 position;
-layout(location=1) in float fade;
-out float cover;
-${PROJECT}
-void main() {
-  float scale, near;
-  gl_Position = project(position, scale, near);
-  cover = fade;
-}`;
-
 const TRAIL_FRAGMENT = `#version 300 es
 precision mediump float;
-in float cover; uniform vec3 ink; out vec4 shown;
-void main() { shown = vec4(ink * cover, cover); }`;
+in vec3 tint; uniform vec3 ink; out vec4 shown;
+void main() { shown = vec4(ink, 1.0) * tint.r; }`;
 
 // Sums of soft spots cover the background from a sixth of a spot on, so that edges are crisp and bodies without gaps.
 const SOFT_WIDTH = 0.62; // standard deviation of a soft spot, in those of the scene's spots
@@ -235,12 +218,10 @@ class GlPainter {
       soft: linked(gl, SPOT_VERTEX, SOFT_FRAGMENT),
       ball: linked(gl, SPOT_VERTEX, BALL_FRAGMENT),
       show: linked(gl, SHOW_VERTEX, SHOW_FRAGMENT),
-      trail: linked(gl, TRAIL_VERTEX, TRAIL_FRAGMENT),
+      trail: linked(gl, SPOT_VERTEX, TRAIL_FRAGMENT),
     };
     this.positions = gl.createBuffer();
     this.tints = gl.createBuffer();
-    this.lines = gl.createBuffer();
-    this.fades = gl.createBuffer();
   }
 
   draw(scene) {
@@ -314,8 +295,8 @@ class GlPainter {
     gl.enable(gl.BLEND);
     gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
     gl.uniform3fv(program.ink, scene.ink);
-    attribute(gl, 0, this.lines, scene.trails.positions, 3);
-    attribute(gl, 1, this.fades, scene.trails.fades, 1);
+    attribute(gl, 0, this.positions, scene.trails.positions, 3);
+    attribute(gl, 1, this.tints, scene.trails.fades, 1);
     gl.drawArrays(gl.LINES, 0, scene.trails.fades.length);
   }
 

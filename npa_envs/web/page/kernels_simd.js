@@ -190,18 +190,6 @@ function listNeighboursCode(dimension) {
   return { ...counts, code };
 }
 
-// For each set of four lanes the bytes that bring them to the front, in order: [16, 16].
-function lanesToFront() {
-  const order = new Uint8Array(256).fill(0xff);
-  for (let set = 0; set < 16; set++) {
-    const lanes = [0, 1, 2, 3].filter((lane) => set & (1 << lane));
-    lanes.forEach((lane, k) => {
-      for (let byte = 0; byte < 4; byte++) order[16 * set + 4 * k + byte] = 4 * lane + byte;
-    });
-  }
-  return order;
-}
-
 // applyLayer(rows, rowBytes, rowEnd, weights, bias, outputs, outputBytes, inputBytes, limit, tiles): for all
 // rows out = W in + b, and max(out, 0) where `limit` is 1. Weights lie tile by tile: [tiles, inputs, 8].
 function applyLayerCode() {
@@ -282,17 +270,6 @@ export function fastestKernels(width, dimension) {
   }
 }
 
-// Returns a function that makes an array of a kind, for example Float32Array, in unused memory.
-function reserveIn(memory) {
-  let used = 16;
-  return (Kind, length) => {
-    const at = used;
-    used += 16 * Math.ceil((Kind.BYTES_PER_ELEMENT * length) / 16);
-    if (used > MEMORY_PAGES * PAGE_BYTES) throw new RangeError("the world is too large for the kernels' memory");
-    return new Kind(memory.buffer, at, length);
-  };
-}
-
 export function simdKernels(width, dimension) {
   const memory = new WebAssembly.Memory({ initial: MEMORY_PAGES });
   const code = assemble({
@@ -301,7 +278,14 @@ export function simdKernels(width, dimension) {
   });
   const instance = new WebAssembly.Instance(new WebAssembly.Module(code), { page: { memory } });
   const run = instance.exports;
-  const reserve = reserveIn(memory);
+  let used = 16;
+  // Makes an array of a kind, for example Float32Array, in unused memory.
+  const reserve = (Kind, length) => {
+    const at = used;
+    used += 16 * Math.ceil((Kind.BYTES_PER_ELEMENT * length) / 16);
+    if (used > MEMORY_PAGES * PAGE_BYTES) throw new RangeError("the world is too large for the kernels' memory");
+    return new Kind(memory.buffer, at, length);
+  };
   const floats = (length) => reserve(Float32Array, length);
 
   function sumNeighbours({ states, list: { count, stateAt, smoothing, slopes }, sums }, i) {
@@ -313,8 +297,12 @@ export function simdKernels(width, dimension) {
   }
 
   const scalars = floats(SCALARS);
-  const order = reserve(Uint8Array, 256);
-  order.set(lanesToFront());
+  // For each set of four lanes the bytes that bring them to the front, in order: [16, 16].
+  const order = reserve(Uint8Array, 256).fill(0xff);
+  for (let set = 0; set < 16; set++) {
+    const bytes = [0, 1, 2, 3].filter((lane) => set & (1 << lane)).flatMap((lane) => [0, 1, 2, 3].map((k) => 4 * lane + k));
+    order.set(bytes, 16 * set);
+  }
   const out = floats(4 + 6 * 4);
   const neighbourCount = new Int32Array(memory.buffer, out.byteOffset, 1);
 

@@ -456,7 +456,7 @@ class Controls {
     $("brushes").dataset.names = names;
     $("brushes").replaceChildren(...brushes.offered.map(({ name, label }, k) => {
       const button = make("button", {
-        innerHTML: icon(name, wordOf(label)), title: `${label} (${(k + 1) % 10})`, onclick: () => brushes.choose(name),
+        innerHTML: icon(name, label.split(":")[0]), title: `${label} (${(k + 1) % 10})`, onclick: () => brushes.choose(name),
       });
       button.dataset.brush = name;
       button.setAttribute("role", "radio");
@@ -574,11 +574,6 @@ function recorder(canvas, done) {
   media.onstop = () => done(`film.${type.slice(6)}`, URL.createObjectURL(new Blob(chunks, { type })));
   media.start(500);
   return { stop: () => media.stop() };
-}
-
-// The word of a brush's label, before the colon.
-function wordOf(label) {
-  return label.split(":")[0];
 }
 
 function options(select, names, chosen) {

@@ -235,8 +235,9 @@ export class Physics {
     const { dimension } = this;
     const cells = [1, 1, 1], inverse = [0, 0, 0];
     this.eps = eps;
-    this.weight = smoothingNorm(eps, dimension);
-    this.slope = spikyNorm(eps, dimension);
+    // The norms of the smoothing and of the spiky kernel.
+    this.weight = dimension === 2 ? 4 / (Math.PI * eps ** 8) : 315 / (64 * Math.PI * eps ** 9);
+    this.slope = dimension === 2 ? 30 / (Math.PI * eps ** 5) : 45 / (Math.PI * eps ** 6);
     // In open space both are 0: there are no images.
     this.sides = new Float64Array(3);
     this.perSide = new Float64Array(3);
@@ -457,14 +458,6 @@ export function wrap(x, count, box) {
     const side = box[i % dimension];
     x[i] -= side * Math.floor(x[i] / side + 0.5);
   }
-}
-
-function smoothingNorm(eps, dimension) {
-  return dimension === 2 ? 4 / (Math.PI * eps ** 8) : 315 / (64 * Math.PI * eps ** 9);
-}
-
-function spikyNorm(eps, dimension) {
-  return dimension === 2 ? 30 / (Math.PI * eps ** 5) : 45 / (Math.PI * eps ** 6);
 }
 
 // Writes L(v) = log(1 + |v|) v / |v| and returns the next index.

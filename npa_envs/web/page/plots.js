@@ -3,19 +3,18 @@
 const KEPT = 2000; // points of a plot; older ones are thinned out
 
 export class Plot {
-  // A canvas with a title in `parent`; `unit` follows the last number.
+  // A line with a title in `parent`; `unit` follows the last number.
   constructor(parent, title, unit = "", { log = false } = {}) {
     this.unit = unit;
     this.log = log;
     this.points = [];
-    this.figure = make("figure", { className: "plot" });
-    const caption = make("figcaption");
-    this.value = make("output");
-    caption.append(make("span", { textContent: title }), this.value);
-    this.canvas = make("canvas");
-    this.canvas.setAttribute("role", "img");
-    this.canvas.setAttribute("aria-label", title);
-    this.figure.append(caption, this.canvas);
+    this.figure = make("figure", {
+      className: "plot", innerHTML: '<figcaption><span></span><output></output></figcaption>' +
+        '<svg viewBox="0 0 1 1" preserveAspectRatio="none" aria-hidden="true"><polyline/></svg>',
+    });
+    this.figure.querySelector("span").textContent = title;
+    this.value = this.figure.querySelector("output");
+    this.line = this.figure.querySelector("polyline");
     parent.append(this.figure);
   }
 
@@ -34,28 +33,13 @@ export class Plot {
   }
 
   draw() {
-    const { canvas, points } = this;
+    const { points } = this;
     this.value.textContent = points.length ? `${short(points.at(-1)[1])} ${this.unit}` : "–";
-    const ratio = window.devicePixelRatio || 1;
-    const width = Math.round(canvas.clientWidth * ratio), height = Math.round(canvas.clientHeight * ratio);
-    if (!width || !height) return;
-    if (canvas.width !== width || canvas.height !== height) Object.assign(canvas, { width, height });
-    const context = canvas.getContext("2d");
-    context.clearRect(0, 0, width, height);
-    if (points.length < 2) return;
-    const level = (y) => (this.log ? Math.log10(Math.max(y, 1e-12)) : y);
-    const levels = points.map(([, y]) => level(y));
+    const levels = points.map(([, y]) => (this.log ? Math.log10(Math.max(y, 1e-12)) : y));
     const low = this.log ? Math.min(...levels) : Math.min(0, ...levels);
-    const high = Math.max(...levels), span = high - low || 1;
-    const first = points[0][0], range = points.at(-1)[0] - first || 1;
-    context.beginPath();
-    points.forEach(([x], k) => context.lineTo(
-      ((x - first) / range) * (width - 2) + 1,
-      height - 2 - ((levels[k] - low) / span) * (height - 4)));
-    context.lineJoin = "round";
-    context.lineWidth = 1.5 * ratio;
-    context.strokeStyle = getComputedStyle(canvas).color;
-    context.stroke();
+    const span = Math.max(...levels) - low || 1, first = points[0]?.[0], range = points.at(-1)?.[0] - first || 1;
+    const places = points.map(([x], k) => `${(x - first) / range},${1 - (levels[k] - low) / span}`);
+    this.line.setAttribute("points", places.join(" "));
   }
 }
 

@@ -84,12 +84,6 @@ export class RuleWorld {
     this.choose(this.rules[0]);
   }
 
-  ruleNamed(name) {
-    const rule = this.rules.find((other) => other.name === name);
-    if (rule === undefined) throw Error(`no rule is called ${name}`);
-    return rule;
-  }
-
   // Chooses a rule with the settings of its task, and starts a new world.
   choose(rule) {
     this.rule = rule;
@@ -218,14 +212,13 @@ export class RuleWorld {
 
   set(name, value) {
     if (name === "loss") return;
-    if (name === "rule") return this.choose(this.ruleNamed(value));
+    if (name === "rule") return this.choose(named(this.rules, value, "rule"));
     if (name === "show") {
       if (!this.rule.world.shows.includes(value)) throw Error(`nothing to show is called ${value}`);
       this.show = value;
       return this.announce();
     }
-    const range = this.rule.world.settings[name];
-    if (range === undefined) throw Error(`no setting is called ${name}`);
+    const range = entry(this.rule.world.settings, name, "setting");
     if (!(value >= range.low && value <= range.high)) {
       const [low, high] = [range.low, range.high].map((end) => +end.toPrecision(3));
       throw Error(`${name} must lie in [${low}, ${high}], got ${value}`);
@@ -237,8 +230,7 @@ export class RuleWorld {
 
   // Applies a message "brush".
   brush(message) {
-    const brush = this.rule.world.tools.find(({ name }) => name === message.tool);
-    if (brush === undefined) throw Error(`no brush is called ${message.tool}`);
+    const brush = named(this.rule.world.tools, message.tool, "brush");
     const [least, added] = brush.amounts;
     BRUSHES[brush.name](this, { ...message, amount: Math.min(1, least + added * message.strength) });
     this.wrapPositions();
@@ -246,7 +238,7 @@ export class RuleWorld {
 
   // Returns the index of a rule's species; a rule that is new in the world is appended.
   speciesOf(name, densityCount) {
-    const rule = this.ruleNamed(name);
+    const rule = named(this.rules, name, "rule");
     const index = this.species.indexOf(rule);
     if (index >= 0) return index;
     if (!this.mayJoin(rule)) {
@@ -320,6 +312,11 @@ export class RuleWorld {
 function entry(table, name, what) {
   if (!Object.hasOwn(table, name)) throw Error(`no ${what} is called ${name}`);
   return table[name];
+}
+
+// Returns the entry of a list that has a name, in the same way.
+function named(list, name, what) {
+  return entry(Object.fromEntries(list.map((one) => [one.name, one])), name, what);
 }
 
 function alike(world, other) {

@@ -1,23 +1,21 @@
 // The engine of the viewer: the server of npa_envs/web/server.py, over a WebSocket.
 
 import { start } from "./page.js";
-import { TrainingCard } from "./training.js";
+import { TrainingCard, addressOf } from "./training.js";
 
 const HEADER = 5; // 32-bit numbers before a frame's positions
 
 // Connects to the server that the page came from; it has no settings.
 async function connect(settings, listener) {
-  const address = new URL("socket", location.href);
+  const address = addressOf("socket");
   address.protocol = address.protocol === "https:" ? "wss:" : "ws:";
-  const token = new URLSearchParams(location.search).get("token");
-  if (token) address.searchParams.set("token", token);
   const socket = new WebSocket(address);
   socket.binaryType = "arraybuffer";
   const send = (message) => {
     if (socket.readyState !== WebSocket.OPEN) return;
     socket.send(message instanceof Blob ? message : JSON.stringify(message));
   };
-  const card = new TrainingCard(send, token);
+  const card = new TrainingCard(send);
   socket.onmessage = ({ data }) => {
     const event = typeof data === "string" ? JSON.parse(data) : frameOf(data);
     card.listen(event);

@@ -8,10 +8,9 @@ const KINDS = "image/*,.glb,.gltf,.obj,.off,.ply,.stl";
 const MINE = "npa-envs training"; // of the tab's storage: the id of the training that it has begun
 
 export class TrainingCard {
-  // `send` sends messages to the server; `token` is that of the page's address, or null.
-  constructor(send, token) {
+  // `send` sends messages to the server.
+  constructor(send) {
     this.send = send;
-    this.token = token;
     this.event = null; // the last event "training"
     this.psnr = null; // of the world that is shown [dB]
     this.upload = null; // what was uploaded last, for another try
@@ -23,26 +22,23 @@ export class TrainingCard {
   }
 
   listen(event) {
-    if (event.type === "psnr") this.psnr = event.value;
-    else if (event.type === "training") {
-      if (!this.card) this.build();
-      // A tab learns of a training once, and may then fold the card.
-      if (ACTIVE.includes(event.state) && event.id !== this.event?.id) this.open = true;
-      this.event = event;
-      const mine = sessionStorage.getItem(MINE) === event.id;
-      if (event.has_rule && mine && this.showing !== event.id) this.show();
-    } else return;
+    if (event.type === "psnr") return this.change({ psnr: event.value });
+    if (event.type !== "training") return;
+    if (!this.card) this.build();
+    // A tab learns of a training once, and may then fold the card.
+    if (ACTIVE.includes(event.state) && event.id !== this.event?.id) this.open = true;
+    this.event = event;
+    const mine = sessionStorage.getItem(MINE) === event.id;
+    if (event.has_rule && mine && this.showing !== event.id) this.show();
     this.render();
   }
 
   build() {
-    const link = make("link", { rel: "stylesheet", href: "training.css" });
     this.file = make("input", { type: "file", accept: KINDS, hidden: true });
     this.file.onchange = () => { if (this.file.files[0]) this.take(this.file.files[0]); this.file.value = ""; };
     this.card = make("section", { id: "training" });
     this.card.setAttribute("aria-label", "Grow your own picture");
     this.cover = make("div", { id: "drop", hidden: true, textContent: "Drop it: it is learned while you watch" });
-    document.head.append(link);
     document.querySelector(".stage").append(this.card, this.cover);
     addEventListener("dragover", (event) => {
       if (!event.dataTransfer.types.includes("Files")) return;
@@ -69,7 +65,7 @@ export class TrainingCard {
       const mib = (size) => Math.ceil(size / 2 ** 20), { limit } = this.event;
       if (content.size > limit)
         throw Error(`${name} has ${mib(content.size)} MiB, at most ${mib(limit)} are taken: give a smaller file`);
-      const answer = await fetch(this.address("training", { name, ...options }), { method: "POST", body: content });
+      const answer = await fetch(addressOf("training", { name, ...options }), { method: "POST", body: content });
       if (!answer.ok) throw Error(await answer.text());
       sessionStorage.setItem(MINE, (await answer.json()).id);
       this.psnr = null;
@@ -77,11 +73,6 @@ export class TrainingCard {
       this.refusal = error.message;
     }
     this.render();
-  }
-
-  address(path, fields = {}) {
-    const query = new URLSearchParams(this.token ? { ...fields, token: this.token } : fields);
-    return `${path}?${query}`;
   }
 
   show() {
@@ -97,22 +88,24 @@ export class TrainingCard {
   }
 
   render() {
-    const { event } = this, active = ACTIVE.includes(event.state);
-    const learned = event.has_rule && !this.choosing;
-    const shown = !this.open ? "closed" : active ? "active" : learned ? "learned" : "empty";
-    const parts = { closed: this.closed, active: this.active, learned: this.learned, empty: this.chooser };
+    const { event, card } = this, learned = event.has_rule && !this.choosing;
+    const shown = !this.open ? "closed" : ACTIVE.includes(event.state) ? "active" : learned ? "learned" : "empty";
     // Not made anew while one types or presses a button, which keeps the focus.
-    const same = shown === this.shown && this.problem === this.problemShown;
-    if (same && (shown === "empty" || this.card.matches(":active"))) return;
-    const { activeElement: focused } = document, inside = this.card.contains(focused);
-    this.card.replaceChildren(...parts[shown].call(this));
-    const again = [...this.card.querySelectorAll("button, a")].find((one) => one.textContent === focused.textContent);
+    const content = shown + this.problem;
+    if (content === this.content && (shown === "empty" || card.matches(":active"))) return;
+    this.content = content;
+    const { activeElement: focused } = document, inside = card.contains(focused);
+    card.replaceChildren(...this[shown](), ...(this.open ? this.problems() : []), this.file);
+    const again = [...card.querySelectorAll("button, a")].find((one) => one.textContent === focused.textContent);
     if (inside) again?.focus();
-    this.shown = shown;
-    this.problemShown = this.problem;
-    this.card.className = shown;
+    card.className = shown;
     // On a phone the card lies above the bar.
-    this.card.style.setProperty("--bar", `${document.getElementById("bar").offsetHeight}px`);
+    card.style.setProperty("--bar", `${document.getElementById("bar").offsetHeight}px`);
+  }
+
+  // Renders with changed fields.
+  change(fields) {
+    this.render(Object.assign(this, fields));
   }
 
   // What went wrong last, for the user.
@@ -127,31 +120,21 @@ export class TrainingCard {
     return [button(label, () => this.change({ open: true }))];
   }
 
-  fold() {
-    this.change({ open: false, choosing: false });
-  }
-
-  // Renders with changed fields.
-  change(fields) {
-    this.render(Object.assign(this, fields));
-  }
-
-  chooser() {
+  empty() {
     const emoji = make("input", { type: "text", placeholder: "\u{1F98A}", maxLength: 16, size: 4 });
     emoji.setAttribute("aria-label", "An emoji");
     const typed = () => { if (emoji.value.trim()) this.take(emoji.value.trim()); };
     emoji.onkeydown = ({ key }) => { if (key === "Enter") typed(); };
     return [
-      heading("Grow your own picture", () => this.fold()),
+      this.heading("Grow your own picture"),
       text("Drop a picture or a 3D file anywhere here. Particles learn it while you watch."),
       row(button("Choose a file", () => this.file.click())),
       row(text("or an emoji"), emoji, button("Grow", typed)),
-      ...this.problems(), this.file,
     ];
   }
 
   active() {
-    const { id, name, state, iteration = 0, total, seconds_left: left } = this.event;
+    const { id, name, note, state, iteration = 0, total, has_rule, seconds_left: left } = this.event;
     const bar = make("progress", { max: total ?? 1 });
     if (total) bar.value = iteration;
     const words = {
@@ -162,12 +145,10 @@ export class TrainingCard {
       this.send({ type: "training", action: "stop" });
       this.change({ stopping: id });
     };
-    const watch = this.showing !== id && this.event.has_rule ? [button("Watch", () => this.show())] : [];
     return [
-      heading(`Learning ${name}`, () => this.fold()), bar,
-      text(this.stopping === id ? "Stopping; what it has learned is saved…" : words[state]),
-      ...(this.event.note ? [text(this.event.note)] : []),
-      row(...this.quality(), ...watch, button("Stop", stop)), ...this.problems(),
+      this.heading(`Learning ${name}`), bar,
+      text(this.stopping === id ? "Stopping; what it has learned is saved…" : words[state]), text(note),
+      row(this.quality(), ...(has_rule && this.showing !== id ? [this.watch()] : []), button("Stop", stop)),
     ];
   }
 
@@ -175,35 +156,52 @@ export class TrainingCard {
     const { id, name, state, folder, seconds, iteration, total } = this.event;
     const stem = name.replace(/\.\w+$/, "");
     const link = (label, file, end) => make("a", {
-      textContent: label, href: this.address(`training/${id}/${file}`), download: `${stem}${end}`,
+      textContent: label, href: addressOf(`training/${id}/${file}`), download: `${stem}${end}`,
     });
     const how = state === "done" ? `Learned in ${duration(seconds)}` : `Stopped at iteration ${iteration} of ${total}`;
-    const watches = this.showing === id;
     return [
-      heading(name, () => this.fold()), text(`${how}. Cut it, wipe a part of it.`), ...this.quality(),
+      this.heading(name), text(`${how}. Cut it, wipe a part of it.`), this.quality(),
       row(link("Save rule", "rule.safetensors", ".safetensors"), link("Save page", "page.html", ".html"),
-        watches ? button("Back", () => this.leave()) : button("Watch", () => this.show()),
+        this.showing === id ? button("Back", () => this.leave()) : this.watch(),
         button("Another", () => this.change({ choosing: true }))),
-      make("p", { className: "path", textContent: `The run is in ${folder}` }), ...this.problems(), this.file,
+      make("p", { className: "path", textContent: `The run is in ${folder}` }),
     ];
+  }
+
+  // A title, and a button that folds the card.
+  heading(words) {
+    const close = button("\u00D7", () => this.change({ open: false, choosing: false }));
+    close.setAttribute("aria-label", "Fold");
+    return row(make("h2", { textContent: words }), close);
+  }
+
+  watch() {
+    return button("Watch", () => this.show());
   }
 
   // Loss, and how near the world comes to the picture.
   quality() {
-    const { loss } = this.event, parts = [];
+    const { loss, id } = this.event, parts = [];
     if (loss !== undefined) parts.push(`loss ${loss.toPrecision(3)}`);
-    if (this.psnr !== null && this.showing === this.event.id) parts.push(`PSNR ${this.psnr.toFixed(1)} dB`);
-    return parts.length ? [text(parts.join(" · "))] : [];
+    if (this.psnr !== null && this.showing === id) parts.push(`PSNR ${this.psnr.toFixed(1)} dB`);
+    return text(parts.join(" · "));
   }
 
   problems() {
-    if (!this.problem) return [];
-    const line = make("p", { className: "problem", textContent: this.problem });
+    const { problem, upload } = this;
+    if (!problem) return [];
+    const line = make("p", { className: "problem", textContent: problem });
     line.setAttribute("role", "alert");
-    const retry = !this.refusal && this.event.cure === "whole" && this.upload
-      ? [row(button("Grow the whole picture", () => this.take(this.upload, { whole: "1" })))] : [];
-    return [line, ...retry];
+    const cured = !this.refusal && this.event.cure === "whole" && upload;
+    return cured ? [line, row(button("Grow the whole picture", () => this.take(upload, { whole: "1" })))] : [line];
   }
+}
+
+// The address of a part of the server, with the token of the page's address.
+export function addressOf(path, fields = {}) {
+  const address = new URL(path, location.href), token = new URLSearchParams(location.search).get("token");
+  address.search = new URLSearchParams(token ? { ...fields, token } : fields);
+  return address;
 }
 
 // A time in words.
@@ -216,22 +214,11 @@ function text(words) {
 }
 
 function row(...parts) {
-  const line = make("div", { className: "row" });
+  const line = make("div", { className: "buttons" });
   line.append(...parts);
   return line;
 }
 
 function button(label, onclick) {
   return make("button", { textContent: label, onclick });
-}
-
-// A title, and a button that folds the card where that is possible.
-function heading(words, fold = null) {
-  const line = row(make("h2", { textContent: words }));
-  if (fold) {
-    const close = button("\u00D7", fold);
-    close.setAttribute("aria-label", "Fold");
-    line.append(close);
-  }
-  return line;
 }
