@@ -148,7 +148,8 @@ class Training:
             if "keep_background" in message and not whole:
                 self._set(cure="whole")
             self._set(state="failed", message=message)
-        if not self._report["has_rule"]:
+        # Not by the report, which may already be that of the next run.
+        if not RunFolder(stored.parent).rule.exists():
             shutil.rmtree(stored.parent, ignore_errors=True)
 
     def _read_and_learn(self, stored: Path, whole: bool) -> None:

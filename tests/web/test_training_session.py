@@ -244,6 +244,19 @@ def _stored(config):
     return {k: v for k, v in config_to_dict(config).items() if k not in ("out", "device")}
 
 
+def test_a_learned_rule_stays_where_the_next_file_comes_at_once(tmp_path, monkeypatch):
+    def learn(self, stored, whole):
+        (stored.parent / "rule.safetensors").write_bytes(b"rule")
+        # The next run's report is there before the thread of this one has ended.
+        self._set(state="reading", has_rule=False)
+
+    monkeypatch.setattr(Training, "_read_and_learn", learn)
+    training = Training(tmp_path)
+    run_id = training.begin("a.png", b"1")
+    training.close()
+    assert (tmp_path / run_id / "rule.safetensors").exists()
+
+
 # With processes.
 
 
