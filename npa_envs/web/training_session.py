@@ -206,12 +206,10 @@ class Training:
         output = path.read_text("utf-8", errors="replace")
         if process.returncode and not self._stopping.is_set():
             _, found, error = output.rpartition("npa-envs: error: ")
-            raise NPAError(
-                error.strip()
-                if found
-                else f"{what} ended with code {process.returncode} (-9 is "
-                f"often a lack of memory): see {path}, or try a smaller file"
-            )
+            what += f" ended with code {process.returncode} (-9 is often a lack of memory)"
+            # The file is removed with the folder of a run without a rule.
+            last = output.strip().rpartition("\n")[2] or "try a smaller file"
+            raise NPAError(error.strip() if found else f"{what}: {last}")
         return output
 
     def _look(self, folder: Path) -> None:

@@ -13,7 +13,6 @@ from npa_envs.measure.wounds import LocalLoss, Wound, part_names
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2D
 from npa_envs.tasks.morphogenesis3d import Morphogenesis3D
-from npa_envs.tasks.seeds import spread_points
 from npa_envs.training import TASKS, preset
 from npa_envs.world.particles import Particles
 
@@ -48,15 +47,6 @@ def test_distances_from_wounds_are_those_from_what_is_moved_or_wiped():
     torch.testing.assert_close(wipe, expected)
     slit = Wound("cut", centre, 0.1, torch.tensor([[2.0, 0.0]])).distance(points)
     torch.testing.assert_close(slit, torch.tensor([[0.0, 0.3, 0.0]]))
-
-
-def test_places_are_far_from_each_other():
-    points = torch.rand(400, 2, generator=torch.Generator().manual_seed(0))
-    chosen = spread_points(points, 9)
-    apart = torch.cdist(chosen, chosen) + torch.eye(9)
-    # A square of side 1 has room for nine places half a side from each other.
-    assert float(apart.min()) > 0.3
-    assert all(bool((points == place).all(-1).any()) for place in chosen)
 
 
 def test_the_loss_near_a_wound_is_the_mean_over_its_pixels_and_the_bound_follows_the_rule(task):
