@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import json
 import os
 import sys
 from collections.abc import Mapping
@@ -97,10 +96,9 @@ def check_same_run(
     check_entries(content, READ_FIRST, path)
     check_task(content, task_name, path)
     try:
-        stored = json.loads(json.dumps(content["config"]))
         # Settings that the run does not have are newer than it is.
         unset = type(config)(task=type(config.task)())
-        theirs = _flat(config_to_dict(override(unset, **stored)))
+        theirs = _flat(config_to_dict(override(unset, **content["config"])))
     except (NPAError, TypeError, ValueError, KeyError, AttributeError, RecursionError) as error:
         raise unusable_checkpoint(path, f"config cannot be read ({shown(error)})") from error
     ours = _flat(config_to_dict(config))

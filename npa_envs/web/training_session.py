@@ -207,7 +207,6 @@ class Training:
         if process.returncode and not self._stopping.is_set():
             _, found, error = output.rpartition("npa-envs: error: ")
             what += f" ended with code {process.returncode} (-9 is often a lack of memory)"
-            # The file is removed with the folder of a run without a rule.
             last = output.strip().rpartition("\n")[2] or "try a smaller file"
             raise NPAError(error.strip() if found else f"{what}: {last}")
         return output
