@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import math
+import os
 import shlex
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields, make_dataclass, replace
@@ -274,7 +275,7 @@ def main(arguments: Sequence[str]) -> int:
         )
     task_name, *options_given = arguments
     of_target = [name for name, entry in TASKS.items() if task_name in entry.targets()]
-    if of_target or Path(task_name).is_file():
+    if task_name not in TASKS and (of_target or os.path.isfile(task_name)):
         hint = f"npa-envs train {(of_target or ['morphogenesis2d'])[0]} --target {task_name}"
         raise NPAError(f"train needs a task first, got the target {shown(task_name)}: {hint}")
     task_entry(task_name)

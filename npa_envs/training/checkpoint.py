@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import json
 import os
 import sys
 from collections.abc import Mapping
@@ -16,7 +15,7 @@ from npa_envs.atomic_files import check_torch_archive, open_regular, write_bytes
 from npa_envs.checks import is_real, is_whole
 from npa_envs.errors import NPAError, shown
 from npa_envs.tasks.train_config import TrainConfig
-from npa_envs.training.task_table import config_to_dict
+from npa_envs.training.task_table import config_to_dict, override
 
 CHECKPOINT_FORMAT = "npa-envs checkpoint"
 
@@ -97,11 +96,10 @@ def check_same_run(
     check_entries(content, READ_FIRST, path)
     check_task(content, task_name, path)
     try:
-        stored = json.loads(json.dumps(content["config"]))
         # Settings that the run does not have are newer than it is.
-        unset = config_to_dict(type(config)(task=type(config.task)()))
-        theirs = _flat(unset) | _flat(stored)
-    except (TypeError, ValueError, KeyError, AttributeError, RecursionError) as error:
+        unset = type(config)(task=type(config.task)())
+        theirs = _flat(config_to_dict(override(unset, **content["config"])))
+    except (NPAError, TypeError, ValueError, KeyError, AttributeError, RecursionError) as error:
         raise unusable_checkpoint(path, f"config cannot be read ({shown(error)})") from error
     ours = _flat(config_to_dict(config))
     differences = [

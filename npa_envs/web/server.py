@@ -316,7 +316,9 @@ class ViewerSession:
                 with self._site.exclusive:
                     world = make()
             except NPAError as error:
-                return self._send_error(str(error))
+                self._send_error(str(error))
+                make = None if make is self._site.make_world else self._site.make_world
+                continue
             try:
                 self._run_world(world)
             except Exception as error:

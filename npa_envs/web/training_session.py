@@ -143,7 +143,8 @@ class Training:
             if "keep_background" in message and not whole:
                 self._set(cure="whole")
             self._set(state="failed", message=message)
-        if not self.report["has_rule"]:
+        # Not by the report, which may already be that of the next run.
+        if not RunFolder(stored.parent).rule.exists():
             shutil.rmtree(stored.parent, ignore_errors=True)
 
     def _read_and_learn(self, stored: Path, whole: bool) -> None:
@@ -205,12 +206,9 @@ class Training:
         output = path.read_text("utf-8", errors="replace")
         if process.returncode and not self._stopping.is_set():
             _, found, error = output.rpartition("npa-envs: error: ")
-            raise NPAError(
-                error.strip()
-                if found
-                else f"{what} ended with code {process.returncode} (-9 is "
-                f"often a lack of memory): see {path}, or try a smaller file"
-            )
+            what += f" ended with code {process.returncode} (-9 is often a lack of memory)"
+            last = output.strip().rpartition("\n")[2] or "try a smaller file"
+            raise NPAError(error.strip() if found else f"{what}: {last}")
         return output
 
     def _look(self, folder: Path) -> None:

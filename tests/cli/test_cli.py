@@ -376,10 +376,15 @@ WRONG_OPTIONS = [
     ("words", "message", "lines"),
     [(*row, 1) for row in MISTAKES] + [(*row, None) for row in WRONG_OPTIONS],
 )
-def test_a_mistake_is_refused_and_nothing_is_written(words, message, lines, rule, tmp_path, capsys):
+def test_a_mistake_is_refused_and_nothing_is_written(
+    words, message, lines, rule, tmp_path, capsys, monkeypatch
+):
     names = {"OUT": tmp_path / "out", "FILE/inside": tmp_path / "file/a", "RULE": rule}
     names |= {"3D": tmp_path / "3d.safetensors", "UNTOLD": tmp_path / "untold.safetensors"}
-    (tmp_path / "file").touch()
+    monkeypatch.chdir(tmp_path)
+    # A task is one also where a file has its name.
+    for name in ("file", "morphogenesis2d"):
+        (tmp_path / name).touch()
     save_rule(NPARule(3, 8, 16), names["3D"])
     save_rule(NPARule(2, 8, 16, eps0=0.2), names["UNTOLD"])
     options = " ".join([*TINY[1:], "--milestones"])

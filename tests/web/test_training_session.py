@@ -237,6 +237,19 @@ def test_an_old_world_begins_again_with_a_later_rule_and_once_more_at_the_end(tm
     assert world.step == 5
 
 
+def test_a_learned_rule_stays_where_the_next_file_comes_at_once(tmp_path, monkeypatch):
+    def learn(self, stored, whole):
+        (stored.parent / "rule.safetensors").write_bytes(b"rule")
+        # The next run's report is there before the thread of this one has ended.
+        self._set(state="reading", has_rule=False)
+
+    monkeypatch.setattr(Training, "_read_and_learn", learn)
+    training = Training(tmp_path)
+    run_id = training.begin("a.png", b"1")
+    training.close()
+    assert (tmp_path / run_id / "rule.safetensors").exists()
+
+
 # With processes.
 
 

@@ -12,10 +12,12 @@ import time
 
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 
 from npa_envs.errors import MissingDependencyError, NPAError
 from npa_envs.web.messages import FrameEvent
+from npa_envs.world.particles import Particles
 
 pytest.importorskip("uvicorn")
 testclient = pytest.importorskip("starlette.testclient")
@@ -23,6 +25,7 @@ testclient = pytest.importorskip("starlette.testclient")
 from starlette.websockets import WebSocketDisconnect  # noqa: E402
 
 from npa_envs.web import server  # noqa: E402
+from npa_envs.web.training_session import Training  # noqa: E402
 
 HERE = "http://127.0.0.1:8765"
 SOCKET = "ws://127.0.0.1:8765/socket"
@@ -258,13 +261,22 @@ def test_a_world_that_fails_is_paused_and_says_why(client, worlds):
 
 
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
-def test_the_page_learns_why_there_is_no_world(tmp_path):
+def test_the_page_learns_why_there_is_no_world(tmp_path, monkeypatch):
     def fail():
         raise NPAError("no such rule")
 
     site = server.Site(fail, films=tmp_path)
     with client_of(site).websocket_connect(SOCKET) as reader:
         assert next_error(reader) == "no such rule"
+
+    # A training's world that cannot be made leaves the page with its own.
+    monkeypatch.setattr(Counter, "particles", Particles(*torch.zeros(2, 1, 2, 2)), raising=False)
+    site = server.Site(Counter, films=tmp_path, training=Training(tmp_path))
+    site.training._set(id="a", name="a.png", folder=str(tmp_path / "gone"), has_rule=True)
+    with meet(client_of(site)) as reader:
+        reader.send_json({"type": "training", "action": "show"})
+        assert "gone" in next_error(reader)
+        assert next_event(reader, "world")["title"] == "counter"
 
     class Broken(Counter):
         def advance(self):
