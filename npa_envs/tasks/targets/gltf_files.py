@@ -39,6 +39,7 @@ _APPEARANCE = ("KHR_materials_", "KHR_lights_", "KHR_animation_", "KHR_xmp", "EX
 
 _COMPONENTS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
 _KINDS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
+_LINES = (0, 1, 2, 3)  # modes of points and lines
 _WRAPS: dict[Any, Wrap] = {33648: "mirror", 33071: "clamp"}
 _MAX_VALUES = 2**27
 _MAX_PARTS = 2**16
@@ -181,8 +182,8 @@ class _Gltf:
         below = {child for node in nodes for child in node.get("children", [])}
         roots = [k for k in range(len(nodes)) if k not in below]
         scene = self._item("scenes", self.root.get("scene", 0)) if scenes else {"nodes": roots}
-        self.file.count_left_out(len(scenes) - 1, "scene", "scenes")
-        self.file.count_left_out(len(self.root.get("animations", [])), "animation", "animations")
+        self.file.count_left_out(len(scenes) - 1, "scene(s)")
+        self.file.count_left_out(len(self.root.get("animations", [])), "animation(s)")
         read = (*_READ, _DRACO, _MESHOPT)
         used = [name for name in self.root.get("extensionsUsed", []) if name not in read]
         if used:
@@ -221,8 +222,7 @@ class _Gltf:
             # The joints say where the vertices are.
             places = np.eye(4)[None]
         modes = [primitive.get("mode", 4) for primitive in mesh["primitives"]]
-        lines = sum(mode in (0, 1, 2, 3) for mode in modes)
-        self.file.count_left_out(lines, "part of points or lines", "parts of points or lines")
+        self.file.count_left_out(sum(k in _LINES for k in modes), "part(s) of points or lines")
         for k, primitive in enumerate(mesh["primitives"]):
             key = (node["mesh"], k)
             if key not in self.known or "skin" in node or "weights" in node:
@@ -251,7 +251,7 @@ class _Gltf:
         """Return the triangles of a primitive, None if it has none or is invisible."""
         attributes = primitive["attributes"]
         if mode not in (4, 5, 6) or "POSITION" not in attributes:
-            if mode not in (0, 1, 2, 3):
+            if mode not in _LINES:
                 self.file.left_out(f"a part of mode {shown(mode)}, or without positions")
             return None
         position = attributes["POSITION"]
@@ -269,7 +269,7 @@ class _Gltf:
             triangles = np.stack((hub, corners[1:-1], corners[2:]), axis=1)
         else:
             more = len(corners) % 3
-            self.file.count_left_out(more, "corner too many", "corners too many")
+            self.file.count_left_out(more, "corner(s) too many")
             triangles = corners[: len(corners) - more].reshape(-1, 3)
         self.file.check_corners(raw, triangles)
         used, faces = np.unique(triangles, return_inverse=True)

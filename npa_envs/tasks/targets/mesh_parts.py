@@ -76,10 +76,10 @@ class MeshFile:
         """Warn of what was left out."""
         left_out(self.path.name, text)
 
-    def count_left_out(self, count: int, one: str, more: str) -> None:
-        """Warn of a number of things that were left out, if there were any."""
+    def count_left_out(self, count: int, things: str) -> None:
+        """Warn of a number of things, such as "corner(s)", that were left out, if any were."""
         if count > 0:
-            self.left_out(f"{count} {one if count == 1 else more}")
+            self.left_out(f"{count} {things.replace('(s)', 's' * (count > 1))}")
 
     def neighbour(self, name: str) -> bytes | None:
         """Return the bytes of a file that this one names, None if it is not there.
@@ -132,8 +132,7 @@ class MeshFile:
         `corners` are the vertex indices of all polygons, `counts` their numbers of corners.
         """
         self.check_corners(vertices, corners)
-        few = "face{} with fewer than three corners"
-        self.count_left_out(int((counts < 3).sum()), few.format(""), few.format("s"))
+        self.count_left_out(int((counts < 3).sum()), "face(s) with fewer than three corners")
         try:
             return triangulated(vertices[corners], counts)
         except NPAError as error:

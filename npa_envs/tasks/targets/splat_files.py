@@ -162,7 +162,7 @@ def _points(file: MeshFile, vertex: Element) -> GaussianCloud:
         file.left_out("colours, as the file has none: all is grey")
         colours = np.full(points.shape, file.plain)
     finite = np.isfinite(points).all(axis=1)
-    file.count_left_out(int((~finite).sum()), "point without a place", "points without a place")
+    file.count_left_out(int((~finite).sum()), "point(s) without a place")
     step = -(-len(points) // MAX_POINTS)
     if step > 1:
         file.left_out(f"all points but one of {step}, as there are {len(points)}")
@@ -170,9 +170,7 @@ def _points(file: MeshFile, vertex: Element) -> GaussianCloud:
     unique, first = np.unique(points, axis=0, return_index=True)
     if len(unique) <= NEIGHBOURS:
         raise file.error(f"must hold at least {NEIGHBOURS + 1} points apart, got {len(unique)}")
-    file.count_left_out(
-        len(points) - len(unique), "point at the place of another", "points at places of others"
-    )
+    file.count_left_out(len(points) - len(unique), "point(s) at the place of another")
     points, colours = unique, colours[first]
     distances, nearest = KDTree(points).query(points, k=NEIGHBOURS + 1)
     apart = points[nearest] - points[nearest].mean(axis=1, keepdims=True)
