@@ -2,8 +2,8 @@
 
 trimesh neither multiplies factors with textures nor knows a second set of texture coordinates
 (case glb_factor_and_texture), makes all grey where parts are coloured in different ways
-(glb_parts_coloured_in_different_ways), and reads Draco parts as zeros, an instance alone and no
-fans (glb_extensions_that_are_required).
+(glb_parts_coloured_in_different_ways), and reads Draco parts as zeros, one of several instances and
+no fans (glb_extensions_that_are_required).
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ _DRACO, _MESHOPT = "KHR_draco_mesh_compression", "EXT_meshopt_compression"
 _INSTANCES, _WEBP = "EXT_mesh_gpu_instancing", "EXT_texture_webp"
 _TRANSFORM, _GLOSS = "KHR_texture_transform", "KHR_materials_pbrSpecularGlossiness"
 _VISIBILITY = "KHR_node_visibility"
-_READ = (_INSTANCES, _WEBP, _TRANSFORM, _GLOSS, _VISIBILITY, "KHR_mesh_quantization")
+_READ = (_WEBP, _TRANSFORM, _GLOSS, _VISIBILITY, "KHR_mesh_quantization")
 
 _APPEARANCE = ("KHR_materials_", "KHR_lights_", "KHR_animation_", "KHR_xmp", "EXT_lights_")
 """How the names of extensions begin without which shape and colour are nearly right."""
@@ -184,7 +184,7 @@ class _Gltf:
         scene = self._item("scenes", self.root.get("scene", 0)) if scenes else {"nodes": roots}
         self.file.count_left_out(len(scenes) - 1, "scene(s)")
         self.file.count_left_out(len(self.root.get("animations", [])), "animation(s)")
-        read = (*_READ, _DRACO, _MESHOPT)
+        read = (*_READ, _DRACO, _MESHOPT, _INSTANCES)
         used = [name for name in self.root.get("extensionsUsed", []) if name not in read]
         if used:
             self.file.left_out(f"what {shown(', '.join(used))} would change")
@@ -212,15 +212,14 @@ class _Gltf:
         return [part for node in drawn for part in self._parts_of(node)]
 
     def _parts_of(self, node: dict[str, Any]) -> list[Part]:
-        """Return the parts of a node's mesh, each with all instances of it."""
-        places, mesh, parts = node["place"][None], self._item("meshes", node["mesh"]), []
-        if instances := _extension(node, _INSTANCES).get("attributes"):
-            rows = ("TRANSLATION", "ROTATION", "SCALE")
-            each = (self._values(instances[k]) if k in instances else None for k in rows)
-            places = node["place"] @ _placed(*each)
-        if "skin" in node:
-            # The joints say where the vertices are.
-            places = np.eye(4)[None]
+        """Return the parts of a node's mesh."""
+        if _extension(node, _INSTANCES):
+            raise self._refused(_INSTANCES)
+        # The joints of a skin say where the vertices are.
+        place = np.eye(4) if "skin" in node else node["place"]
+        # What is mirrored must not be turned inside out.
+        order = (2, 1, 0) if np.linalg.det(place[:3, :3]) < 0 else (0, 1, 2)
+        mesh, parts = self._item("meshes", node["mesh"]), []
         modes = [primitive.get("mode", 4) for primitive in mesh["primitives"]]
         self.file.count_left_out(sum(k in _LINES for k in modes), "part(s) of points or lines")
         for k, primitive in enumerate(mesh["primitives"]):
@@ -230,19 +229,13 @@ class _Gltf:
             part = self.known[key]
             if part is None:
                 continue
-            self.triangles += len(part.faces) * len(places)
+            self.triangles += len(part.faces)
             self.part_count += 1
             if self.triangles > MAX_TRIANGLES or self.part_count > _MAX_PARTS:
                 raise self._too_large()
-            # What is mirrored must not be turned inside out.
-            order = np.where(np.linalg.det(places[:, :3, :3])[:, None] < 0, (2, 1, 0), (0, 1, 2))
-            where = order[:, None] + 3 * np.arange(len(part.faces))[:, None]
-            starts = len(part.vertices) * np.arange(len(places))[:, None, None]
-            points = part.vertices @ places[:, :3, :3].mT + places[:, None, :3, 3]
-            faces = (part.faces.reshape(-1)[where] + starts).reshape(-1, 3)
-            colours = part.colours.reshape(-1, 3)[where].reshape(-1, 3, 3)
-            uv = part.uv.reshape(-1, 2)[where].reshape(-1, 3, 2)
-            parts.append(Part(points.reshape(-1, 3), faces, colours, uv, part.texture))
+            points = part.vertices @ place[:3, :3].T + place[:3, 3]
+            corners = (each[:, order] for each in (part.faces, part.colours, part.uv))
+            parts.append(Part(points, *corners, part.texture))
         return parts
 
     def _part(
@@ -378,27 +371,14 @@ def _local(node: dict[str, Any]) -> FloatArray:
     """Return the motion of a node in the one above it, [4, 4]."""
     if "matrix" in node:
         return np.array(node["matrix"], dtype=np.float64).reshape(4, 4).T
-    keys = ("translation", "rotation", "scale")
-    each = (np.array(node[key], dtype=np.float64)[None] if key in node else None for key in keys)
-    placed: FloatArray = _placed(*each)[0]
-    return placed
-
-
-def _placed(t: FloatArray | None, q: FloatArray | None, s: FloatArray | None) -> FloatArray:
-    """Return motions [I, 4, 4] that scale by s, rotate by quaternions q (x y z w), move by t."""
-    motions = np.tile(
-        np.eye(4), (max(1 if each is None else len(each) for each in (t, q, s)), 1, 1)
+    turn = np.array(node.get("rotation", (0, 0, 0, 1)), dtype=np.float64)
+    x, y, z, w = turn / np.linalg.norm(turn)
+    rows = (
+        (1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)),
+        (2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)),
+        (2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)),
     )
-    if q is not None:
-        x, y, z, w = (q / np.linalg.norm(q, axis=1, keepdims=True)).T
-        rows = (
-            (1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)),
-            (2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)),
-            (2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)),
-        )
-        motions[:, :3, :3] = np.array(rows).transpose(2, 0, 1)
-    if s is not None:
-        motions[:, :3, :3] *= s[:, None]
-    if t is not None:
-        motions[:, :3, 3] = t
-    return motions
+    motion: FloatArray = np.eye(4)
+    motion[:3, :3] = np.array(rows) * np.array(node.get("scale", (1, 1, 1)), dtype=np.float64)
+    motion[:3, 3] = node.get("translation", (0, 0, 0))
+    return motion
