@@ -24,15 +24,13 @@ from npa_envs.tasks.targets.mesh_parts import (
     IntArray,
     MeshFile,
     Part,
-    strip,
 )
 from npa_envs.tasks.targets.meshes import FloatArray, Wrap, srgb_values
 
 _DRACO, _MESHOPT = "KHR_draco_mesh_compression", "EXT_meshopt_compression"
 _INSTANCES, _WEBP = "EXT_mesh_gpu_instancing", "EXT_texture_webp"
 _TRANSFORM, _GLOSS = "KHR_texture_transform", "KHR_materials_pbrSpecularGlossiness"
-_VISIBILITY = "KHR_node_visibility"
-_READ = (_WEBP, _TRANSFORM, _GLOSS, _VISIBILITY, "KHR_mesh_quantization")
+_READ = (_WEBP, _TRANSFORM, _GLOSS, "KHR_mesh_quantization")
 
 _APPEARANCE = ("KHR_materials_", "KHR_lights_", "KHR_animation_", "KHR_xmp", "EXT_lights_")
 """How the names of extensions begin without which shape and colour are nearly right."""
@@ -201,14 +199,9 @@ class _Gltf:
                     f"must have nodes that form a tree, node {index} is in a loop"
                 )
             self.world[index] = outer @ _local(node)
-            visible = visible and _extension(node, _VISIBILITY).get("visible", True)
             if visible and "mesh" in node:
                 drawn.append(node | {"place": self.world[index]})
             stack += [(k, self.world[index], visible) for k in reversed(node.get("children", []))]
-        if not nodes:
-            drawn = [
-                {"mesh": k, "place": np.eye(4)} for k in range(len(self.root.get("meshes", [])))
-            ]
         return [part for node in drawn for part in self._parts_of(node)]
 
     def _parts_of(self, node: dict[str, Any]) -> list[Part]:
@@ -234,8 +227,8 @@ class _Gltf:
             if self.triangles > MAX_TRIANGLES or self.part_count > _MAX_PARTS:
                 raise self._too_large()
             points = part.vertices @ place[:3, :3].T + place[:3, 3]
-            corners = (each[:, order] for each in (part.faces, part.colours, part.uv))
-            parts.append(Part(points, *corners, part.texture))
+            faces, colours, uv = part.faces[:, order], part.colours[:, order], part.uv[:, order]
+            parts.append(Part(points, faces, colours, uv, part.texture))
         return parts
 
     def _part(
@@ -255,15 +248,18 @@ class _Gltf:
         corners = np.arange(len(raw))
         if "indices" in primitive:
             corners = self._raw(primitive["indices"])[:, 0].astype(np.int64)
+        first, second, third = (corners[k : k - 2 or None] for k in range(3))
         if mode == 5:
-            triangles = strip(corners)
+            # Every other triangle of a strip turns the other way.
+            odd = np.arange(len(first)) % 2 == 1
+            first, second = np.where(odd, second, first), np.where(odd, first, second)
         elif mode == 6:
-            hub = np.repeat(corners[:1], max(0, len(corners) - 2))
-            triangles = np.stack((hub, corners[1:-1], corners[2:]), axis=1)
+            first = np.repeat(corners[:1], len(second))
         else:
             more = len(corners) % 3
             self.file.count_left_out(more, "corner(s) too many")
-            triangles = corners[: len(corners) - more].reshape(-1, 3)
+            first, second, third = corners[: len(corners) - more].reshape(-1, 3).T
+        triangles = np.stack((first, second, third), axis=1)
         self.file.check_corners(raw, triangles)
         used, faces = np.unique(triangles, return_inverse=True)
         points, targets = self._values(position, used), primitive.get("targets", [])

@@ -6,7 +6,6 @@ import functools
 import io
 import math
 import re
-import struct
 import warnings
 from collections import Counter
 from dataclasses import replace
@@ -24,7 +23,6 @@ from npa_envs.tasks.targets.mesh_parts import (
     IntArray,
     MeshFile,
     Part,
-    strip,
     unit_colours,
 )
 from npa_envs.tasks.targets.meshes import MAX_FILE, FloatArray, Mesh
@@ -183,10 +181,7 @@ def _read_rows(
         return np.dtype(np.float64 if order == "=" else order + _PLY_TYPES[kind])
 
     keys, kinds = [key for key, _, _ in properties], [stored(kind) for _, _, kind in properties]
-    counters = [
-        struct.Struct(order + stored(c).char.replace("l", "q")) if c else None
-        for _, c, _ in properties
-    ]
+    counters = [stored(counted) if counted else None for _, counted, _ in properties]
     if not any(counters):
         fields = list(zip(keys, kinds, strict=True))
         rows = np.frombuffer(data, fields, count, start) if count else np.empty(0, fields)
@@ -200,8 +195,8 @@ def _read_rows(
             for counter, kind, found, sizes in plan:
                 length = 1
                 if counter is not None:
-                    length = int(counter.unpack_from(data, end)[0])
-                    end += counter.size
+                    length = int(np.frombuffer(data, counter, 1, end)[0])
+                    end += counter.itemsize
                 start, end = end, end + length * kind.itemsize
                 if not start <= end <= len(data):
                     raise ValueError("it ends too early")
@@ -226,8 +221,10 @@ def ply_colours(file: MeshFile, element: dict[str, PlyProperty]) -> FloatArray |
 
 
 def _read_ply_parts(file: MeshFile, content: bytes) -> list[Part]:
-    """Return the parts of a PLY file, one for each texture, and one for strips of triangles."""
+    """Return the parts of a PLY file, one for each texture."""
     elements, comments = read_ply(content)
+    if "tristrips" in elements:
+        raise file.error("has strips of triangles (tristrips), which are not read: save faces")
     vertex, face = elements.get("vertex", {}), elements.get("face", {})
     vertices = np.stack([vertex[key].values.astype(np.float64) for key in "xyz"], axis=1)
     nothing = PlyProperty(np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64))
@@ -255,20 +252,15 @@ def _read_ply_parts(file: MeshFile, content: bytes) -> list[Part]:
             name = names[int(number)]
             read = functools.partial(file.neighbour, name)
             texture = file.texture(name, read, ("repeat", "repeat"))
-        part = Part(vertices, faces[chosen], None if colours is None else colours[chosen])
-        if texture is not None and uv is not None:
+        if texture is None or uv is None:
+            part = Part(vertices, faces[chosen], None if colours is None else colours[chosen])
+        else:
             if colours is not None:
                 file.left_out("colours where there is a texture")
             # In this format v goes up.
             flipped = uv[chosen] * (1.0, -1.0) + (0.0, 1.0)
             part = Part(vertices, faces[chosen], None, flipped, texture.texture)
         parts.append(part)
-    if "tristrips" in elements:
-        values = elements["tristrips"]["vertex_indices"].values.astype(np.int64)
-        runs = np.split(values, np.flatnonzero(values == -1))
-        faces = np.concatenate([strip(run[run != -1]) for run in runs])
-        file.check_corners(vertices, faces)
-        parts.append(Part(vertices, faces, None if at_corners is None else at_corners[faces]))
     return parts
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections import deque
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -22,9 +23,8 @@ MAX_TRIANGLES = 2**23
 """Maximum number of triangles of a mesh."""
 
 _MAX_TEXELS = 2**27
-_MAX_WORK = 2**28
-_MAX_SEARCHES = 4
-_VECTORISED = 40  # corners
+_MAX_WORK = 2**27
+_MAX_TRIES = 8  # for each corner of a polygon
 
 
 class FileTexture(NamedTuple):
@@ -202,14 +202,6 @@ def triangulated(points: FloatArray, counts: IntArray) -> tuple[IntArray, IntArr
     return np.concatenate(triangles)[order], np.concatenate(owners)[order]
 
 
-def strip(run: IntArray) -> IntArray:
-    """Return the triangles [F, 3] of a strip: each corner after the second makes one."""
-    rows = np.stack((run[:-2], run[1:-1], run[2:]), axis=1) if len(run) > 2 else run[:0, None]
-    rows = rows.reshape(-1, 3)
-    rows[1::2] = rows[1::2, [1, 0, 2]]
-    return rows
-
-
 def _flattened(points: FloatArray) -> FloatArray:
     """Return a polygon [n, 3] in the plane of two axes, [n, 2], counterclockwise."""
     around = points - points[0]
@@ -233,53 +225,28 @@ def _is_convex(flat: FloatArray) -> bool:
 
 def _ears(flat: FloatArray) -> IntArray:
     """Return the triangles [n - 2, 3] of a polygon [n, 2] that is not convex."""
-    x, y = flat[:, 0].tolist(), flat[:, 1].tolist()
-    count = len(x)
-    before, after = [count - 1, *range(count - 1)], [*range(1, count), 0]
-
-    def area(a: int, b: int, c: int) -> float:
-        return float((x[b] - x[a]) * (y[c] - y[a]) - (y[b] - y[a]) * (x[c] - x[a]))
-
-    def is_ear(b: int) -> bool:
-        a, c = before[b], after[b]
-        if area(a, b, c) <= 0:
-            return False
-        # Corners at the place of the ear's own are where a hole is joined to the outline.
-        if len(reflex) > _VECTORISED:
-            others = flat[list(reflex)]
-            inside = np.ones(len(others), dtype=bool)
-            for p, q in ((a, b), (b, c), (c, a)):
-                away, along = others - flat[p], flat[q] - flat[p]
-                inside &= along[0] * away[:, 1] - along[1] * away[:, 0] >= 0
-                inside &= (away != 0).any(axis=1)
-            return not inside.any()
-        own = {(x[k], y[k]) for k in (a, b, c)}
-        return not any(
-            area(a, b, k) >= 0 and area(b, c, k) >= 0 and area(c, a, k) >= 0
-            for k in reflex
-            if (x[k], y[k]) not in own
-        )
-
-    left = dict.fromkeys(range(count))
-    reflex = {k for k in left if area(before[k], k, after[k]) <= 0}
-    ears = {k for k in left if is_ear(k)}
-    triangles: list[tuple[int, int, int]] = []
-    searches = 0
+    left, triangles = deque(range(len(flat))), []
+    tries, missed = _MAX_TRIES * len(flat), 0
     while len(left) > 2:
-        if not ears and searches < _MAX_SEARCHES:
-            searches += 1
-            # Without an ear, the outline crosses itself or what is left of it is a line.
-            ears = {k for k in left if is_ear(k)} or {
-                min(left, key=lambda k: abs(area(before[k], k, after[k])))
-            }
-        ear = ears.pop() if ears else next(iter(left))
-        a, c = before[ear], after[ear]
-        triangles.append((a, ear, c))
-        after[a], before[c] = c, a
-        del left[ear]
-        reflex.discard(ear)
-        for k in (a, c):
-            if area(before[k], k, after[k]) > 0:
-                reflex.discard(k)
-            (ears.add if is_ear(k) else ears.discard)(k)
+        a, b, c = left[0], left[1], left[2]
+        # Without an ear, the outline crosses itself or what is left of it is a line.
+        if missed > len(left) or tries < 0 or _is_ear(flat[[a, b, c]], flat[left]):
+            triangles.append((a, b, c))
+            del left[1]
+            left.rotate(1)
+            missed = 0
+        else:
+            left.rotate(-1)
+            missed, tries = missed + 1, tries - 1
     return np.array(triangles, dtype=np.int64)
+
+
+def _is_ear(corners: FloatArray, outline: FloatArray) -> bool:
+    """Return whether a triangle [3, 2] turns left, and no corner of the outline [n, 2] is in it."""
+    along = np.roll(corners, -1, axis=0) - corners
+    away = outline[:, None] - corners
+    inside = (along[:, 0] * away[..., 1] - along[:, 1] * away[..., 0] >= 0).all(axis=1)
+    # Corners at the place of the ear's own are where a hole is joined to the outline.
+    inside &= (away != 0).any(axis=2).all(axis=1)
+    (ux, uy), (vx, vy) = along[:2]
+    return bool(ux * vy - uy * vx > 0 and not inside.any())

@@ -159,17 +159,19 @@ def _textured_faces(mesh: Mesh, light: FloatArray) -> TexturedFaces | None:
     if mesh.texture_of_face is None or mesh.uv is None or (mesh.texture_of_face < 0).all():
         return None
     limit = min(MAX_TEXELS, MAX_ALL_TEXELS // len(mesh.textures))
-    texels, headers, total = [], [], 0
+    texels: list[NDArray[np.uint8]] = []
+    headers: list[list[tuple[int, int, int]]] = []
+    total = 0
     for texture in mesh.textures:
-        pixels, header = texture.pixels, []
+        pixels = texture.pixels
         while pixels[..., 0].size > limit:
             pixels = halved(pixels)
-        while not header or texels[-1].size > 3:
-            header.append((total, pixels.shape[1], pixels.shape[0]))
+        headers.append([])
+        while not headers[-1] or texels[-1].size > 3:
+            headers[-1].append((total, pixels.shape[1], pixels.shape[0]))
             texels.append(pixels.reshape(-1, 3))
             total += len(texels[-1])
             pixels = halved(pixels)
-        headers.append(header)
     depth = max(map(len, headers))
     levels = [header + [(0, 0, 0)] * (depth - len(header)) for header in headers]
     wrap = [[WRAP_NUMBERS[side] for side in texture.wrap] for texture in mesh.textures]

@@ -226,15 +226,10 @@ def draw_splats(splats: GaussianCloud, cameras: Cameras) -> Tensor:
     Gaussians have their own colours, without the light of meshes.
     """
     samples = max(1, min(SAMPLES, MAX_SIDE // max(cameras.width, cameras.height)))
-    fine = replace(
-        cameras,
-        intrinsics=samples * cameras.intrinsics,
-        width=samples * cameras.width,
-        height=samples * cameras.height,
-    )
+    fine = replace(cameras, width=samples * cameras.width, height=samples * cameras.height)
+    lenses = samples * cameras.intrinsics.expand(cameras.count, 4)
     pictures = []
-    for k, motion in enumerate(cameras.world_to_camera):
-        lens = fine.intrinsics if fine.intrinsics.ndim == 1 else fine.intrinsics[k]
+    for motion, lens in zip(cameras.world_to_camera, lenses, strict=True):
         camera = replace(fine, world_to_camera=motion[None], intrinsics=lens)
         eye = -motion[:3, :3].mT @ motion[:3, 3]
         drawn = render_gaussians(

@@ -245,14 +245,10 @@ def _read_view_folder(
     folder: Path, resolution: int, training_count: int, held_out_count: int
 ) -> ViewTarget:
     """Return the target in a folder of views, as `load_views` describes."""
-    splits = [
-        _thinned(frames, count)
-        for frames, count in zip(
-            _read_splits(folder), (training_count, held_out_count), strict=True
-        )
-    ]
-    background = _plain_background(folder, [frame for frames in splits for frame in frames])
-    training, measured = (_views_of(frames, resolution, background) for frames in splits)
+    frames, others = _read_splits(folder)
+    frames, others = _thinned(frames, training_count), _thinned(others, held_out_count)
+    background = _plain_background(folder, frames + others)
+    training, measured = (_views_of(each, resolution, background) for each in (frames, others))
     radius = max(scene_radius(training), scene_radius(measured))
     if radius == 0.0:
         raise NPAError(
@@ -261,13 +257,10 @@ def _read_view_folder(
         )
     for views in (training, measured):
         views.cameras.world_to_camera[:, :3, 3] *= RADIUS / radius
-    first = open_image(splits[0][0].picture)
-    how = (
-        "alpha"
-        if background is None
-        else f"their plain background, sRGB {background.astype(int).tolist()}"
-    )
-    counts = f"{len(splits[0])} views to train with, {len(splits[1])} held out"
+    first, how = open_image(frames[0].picture), "alpha"
+    if background is not None:
+        how = f"their plain background, sRGB {background.astype(int).tolist()}"
+    counts = f"{len(frames)} views to train with, {len(others)} held out"
     summary = f"{folder.name}: {counts}, {first.width} x {first.height}, cut out by {how}"
     return ViewTarget(folder.name, training, measured, summary)
 
@@ -400,8 +393,20 @@ def _lens_of(
             f"w and h of {where} must be those of its picture, {size[0]} and {size[1]}, or in that "
             f"ratio, got {shown(width)} and {shown(height)}"
         )
-    across = _focal_length(given, where, "x", width)
-    down = _focal_length(given, where, "y", height)
+    lengths = []
+    for axis, side in (("x", width), ("y", height)):
+        focal, angle = given.get(f"fl_{axis}"), given.get(f"camera_angle_{axis}")
+        if focal is not None and not focal > 0.0:
+            raise NPAError(f"fl_{axis} of {where} must be positive [pixels], got {shown(focal)}")
+        if angle is not None and not 0.0 < angle < math.pi:
+            raise NPAError(
+                f"camera_angle_{axis} of {where} must be an angle between 0 and pi radians, "
+                f"got {shown(angle)}"
+            )
+        if focal is None and angle is not None:
+            focal = 0.5 * side / math.tan(0.5 * angle)
+        lengths.append(focal)
+    across, down = lengths
     if across is None and down is None:
         raise NPAError(
             f"camera_angle_x of {where} must be an angle between 0 and pi radians, got None; fl_x "
@@ -413,28 +418,13 @@ def _lens_of(
     return pinhole * np.tile(np.divide(size, (width, height)), 2), distortion
 
 
-def _focal_length(given: Mapping[str, Any], where: str, axis: str, side: float) -> float | None:
-    """Return the focal length along an axis [pixels], None if the file does not say it."""
-    focal, angle = given.get(f"fl_{axis}"), given.get(f"camera_angle_{axis}")
-    if focal is not None and not focal > 0.0:
-        raise NPAError(f"fl_{axis} of {where} must be positive [pixels], got {shown(focal)}")
-    if angle is not None and not 0.0 < angle < math.pi:
-        raise NPAError(
-            f"camera_angle_{axis} of {where} must be an angle between 0 and pi radians, "
-            f"got {shown(angle)}"
-        )
-    if focal is None and angle is not None:
-        focal = 0.5 * side / math.tan(0.5 * angle)
-    return None if focal is None else float(focal)
-
-
 # Pictures.
 
 
 def _thinned(frames: Sequence[FolderView], count: int) -> list[FolderView]:
     """Return at most `count` evenly spaced frames."""
-    total = len(frames)
-    return [frames[k * total // min(count, total)] for k in range(min(count, total))]
+    count = min(count, len(frames))
+    return [frames[k * len(frames) // count] for k in range(count)]
 
 
 def _plain_background(folder: Path, frames: Sequence[FolderView]) -> FloatImage | None:
