@@ -129,7 +129,7 @@ def test_grey_tiffs_are_scaled_by_their_depth_or_refused(
     write_tiff(path, samples, photometric=photometric, order=order, packed=packed)
     read_by_pillow = photometric == 1 or kind in ("u1", "f4") or (kind == "u2" and order == "<")
     if not read_by_pillow or (kind == "u4" and order == ">"):
-        with pytest.raises(NPAError, match=rf"TIFF of bits \({8 * dtype.itemsize},\).*PNG"):
+        with pytest.raises(NPAError, match="TIFF of a kind that Pillow does not read"):
             open_image(path)
         return
     rgba = pixels(path)
@@ -176,8 +176,8 @@ def test_floats_on_another_scale_and_kinds_that_pillow_cannot_read_are_named(tmp
     write_tiff(tmp_path / "c.tif", np.stack([levels] * 3, -1).astype("<f4"), photometric=2)
     for name, message in (
         ("a", "floats, of which 1 is white, .* the largest is 255: divide them"),
-        ("b", r"bits \(16,\), sample format \(3,\), photometric 1, which Pillow does not read"),
-        ("c", r"bits \(32, 32, 32\), sample format \(3, 3, 3\), photometric 2"),
+        ("b", "TIFF of a kind that Pillow does not read"),
+        ("c", "TIFF of a kind that Pillow does not read"),
     ):
         with pytest.raises(NPAError, match=message):
             open_image(tmp_path / f"{name}.tif")
@@ -194,36 +194,27 @@ def test_palettes_of_tiffs_with_8_bits_are_not_black(tmp_path):
 COLOUR = (0.25, 0.5, 1.0)
 
 
-@pytest.mark.parametrize("kind", ["u1", "u2"])
-@pytest.mark.parametrize("planes", [1, 2])
+@pytest.mark.parametrize(
+    ("colour", "kind", "planes", "packed"),
+    [([0.25], "u1", 1, False), *itertools.product([COLOUR], ["u1", "u2"], [1, 2], [False, True])],
+)
 @pytest.mark.parametrize("premultiplied", [False, True])
-@pytest.mark.parametrize("packed", [False, True])
 def test_alpha_of_tiffs_is_read_whether_or_not_colours_are_multiplied_by_it(
-    tmp_path, kind, planes, premultiplied, packed
+    tmp_path, colour, kind, planes, packed, premultiplied
 ):
     alpha = np.where(DISK, 0.75, 0.0)[..., None]
-    colours = np.array(COLOUR) * (alpha if premultiplied else DISK[..., None])
-    top = np.iinfo(kind).max
-    samples = (top * np.concatenate([colours, alpha], -1)).round().astype(kind)
-    kinds = {"photometric": 2, "planes": planes, "packed": packed}
+    colours = np.array(colour) * (alpha if premultiplied else DISK[..., None])
+    samples = (np.iinfo(kind).max * np.concatenate([colours, alpha], -1)).round().astype(kind)
+    kinds = {"photometric": {1: 1, 3: 2}[len(colour)], "planes": planes, "packed": packed}
     write_tiff(tmp_path / "disk.tif", samples, **kinds, t338=[2 - premultiplied])
     if planes == 2 and premultiplied and not packed:
         with pytest.raises(NPAError, match="of a kind that Pillow does not read"):
             open_image(tmp_path / "disk.tif")
         return
     rgba = pixels(tmp_path / "disk.tif")
-    assert abs(rgba[INSIDE] / 255 - (*COLOUR, 0.75)).max() < 2 / 255
+    shade = COLOUR if len(colour) == 3 else 3 * colour
+    assert abs(rgba[INSIDE] / 255 - (*shade, 0.75)).max() < 2 / 255
     assert (rgba[..., 3] > 0).tolist() == DISK.tolist()
-
-
-@pytest.mark.parametrize("premultiplied", [False, True])
-def test_grey_with_alpha_is_read(tmp_path, premultiplied):
-    alpha = np.where(DISK, 200, 0)
-    grey = np.where(DISK, 50 if premultiplied else 64, 0)
-    write_tiff(
-        tmp_path / "disk.tif", np.stack([grey, alpha], -1).astype("u1"), t338=[2 - premultiplied]
-    )
-    assert abs(pixels(tmp_path / "disk.tif")[INSIDE] - (64, 64, 64, 200)).max() <= 1
 
 
 # Colour profiles.
