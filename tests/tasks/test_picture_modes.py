@@ -8,7 +8,7 @@ import zlib
 
 import numpy as np
 import pytest
-from PIL import Image, ImageCms, features
+from PIL import Image, ImageCms, TiffImagePlugin, TiffTags, features
 
 from npa_envs.errors import MissingDependencyError, NPAError
 from npa_envs.tasks.targets.images import open_image, read_image
@@ -53,22 +53,18 @@ def write_tiff(path, samples, *, photometric=1, order="<", packed=False, planes=
     strips = [part.astype(samples.dtype.newbyteorder(order)).tobytes() for part in parts]
     strips = [zlib.compress(strip) for strip in strips] if packed else strips
     lengths = [len(strip) for strip in strips]
-    places = [8 + sum(lengths[:k]) for k in range(len(strips))]
+    # From the end of the directory, to which Pillow adds its place.
+    places = [sum(lengths[:k]) for k in range(len(strips))]
     values = {256: [width], 257: [height], 258: [8 * samples.dtype.itemsize] * count}
     values |= {259: [8 if packed else 1], 262: [photometric], 273: places, 277: [count]}
     values |= {278: [height], 279: lengths, 284: [planes], 339: [kind] * count}
     values |= {int(tag[1:]): value for tag, value in tags.items()}
-    body, later = b"".join(strips), b""
-    body += b"\0" * (len(body) % 2)
-    start = 8 + len(body)
-    directory, end = struct.pack(f"{order}H", len(values)), start + 2 + 12 * len(values) + 4
-    for tag, numbers in sorted(values.items()):
-        content = struct.pack(f"{order}{len(numbers)}I", *numbers)
-        if len(content) > 4:
-            later, content = later + content, struct.pack(f"{order}I", end + len(later))
-        directory += struct.pack(f"{order}HHI", tag, 4, len(numbers)) + content
-    head = (b"II*\0" if order == "<" else b"MM\0*") + struct.pack(f"{order}I", start)
-    path.write_bytes(head + body + directory + b"\0\0\0\0" + later)
+    head = (b"II*\0" if order == "<" else b"MM\0*") + struct.pack(f"{order}I", 8)
+    directory = TiffImagePlugin.ImageFileDirectory_v2(head)
+    for tag, numbers in values.items():
+        directory.tagtype[tag] = TiffTags.LONG
+        directory[tag] = numbers
+    path.write_bytes(head + directory.tobytes(8) + b"".join(strips))
 
 
 def pixels(path):

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from npa_envs.atomic_files import read_bytes
-from npa_envs.errors import NPAError, importing, shown
+from npa_envs.errors import importing, shown
 from npa_envs.tasks.targets.gltf_files import read_gltf
 from npa_envs.tasks.targets.mesh_parts import (
     MAX_TRIANGLES,
@@ -41,17 +41,8 @@ def read_mesh(path: Path) -> Mesh:
     file = MeshFile(path)
     if not content:
         raise file.error("is an empty file (0 bytes): save the mesh again")
-    try:
-        with np.errstate(all="ignore"):
-            return _joined(file, _READERS[path.suffix.lower()](file, content))
-    except NPAError:
-        raise
-    except Exception as error:
-        # Damaged files raise exceptions of many kinds.
-        raise file.error(
-            f"cannot be read as a mesh ({type(error).__name__}: {shown(error)}): save it again, "
-            "for example as .ply or .glb"
-        ) from error
+    with file.reading("a mesh"):
+        return _joined(file, _READERS[path.suffix.lower()](file, content))
 
 
 def _joined(file: MeshFile, parts: list[Part]) -> Mesh:

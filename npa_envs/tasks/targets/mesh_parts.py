@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -71,6 +72,19 @@ class MeshFile:
     def error(self, text: str) -> NPAError:
         """Return an error about this file."""
         return NPAError(f"target {shown(str(self.path))} {text}")
+
+    @contextlib.contextmanager
+    def reading(self, what: str) -> Iterator[None]:
+        """Within it, an exception becomes an error: this file cannot be read as `what`."""
+        try:
+            with np.errstate(all="ignore"):
+                yield
+        except NPAError:
+            raise
+        except Exception as error:
+            # Damaged files raise exceptions of many kinds.
+            cause = f"{type(error).__name__}: {shown(error)}"
+            raise self.error(f"cannot be read as {what} ({cause}): save it again") from error
 
     def left_out(self, text: str) -> None:
         """Warn of what was left out."""

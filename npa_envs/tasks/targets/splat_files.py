@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from npa_envs.atomic_files import open_regular, read_bytes
-from npa_envs.errors import NPAError, importing, shown
+from npa_envs.errors import importing, shown
 from npa_envs.ops import Cameras, render_gaussians
 from npa_envs.tasks.gaussian_outputs import HARMONIC_0
 from npa_envs.tasks.targets.mesh_files import PlyProperty, ply_colours, read_ply
@@ -102,22 +102,12 @@ def read_splats(path: Path) -> GaussianCloud:
     The bounding box of the points, or of the middles of visible Gaussians, is centred at 0.
     """
     file = MeshFile(path)
-    try:
-        with np.errstate(all="ignore"):
-            vertex = read_ply(read_bytes(path, limit=MAX_FILE, what="target"))[0]["vertex"]
-            if "packed_position" in vertex:
-                raise file.error("is compressed (packed_position): save it as an ordinary PLY")
-            trained = ply_kind(path) == "gaussians"
-            splats = (_trained_gaussians if trained else _points)(file, vertex)
-    except NPAError:
-        raise
-    except Exception as error:
-        # Damaged files raise exceptions of many kinds.
-        raise file.error(
-            f"cannot be read as points or Gaussians ({type(error).__name__}: {shown(error)}): save "
-            "it again"
-        ) from error
-    return splats
+    with file.reading("points or Gaussians"):
+        vertex = read_ply(read_bytes(path, limit=MAX_FILE, what="target"))[0]["vertex"]
+        if "packed_position" in vertex:
+            raise file.error("is compressed (packed_position): save it as an ordinary PLY")
+        trained = ply_kind(path) == "gaussians"
+        return (_trained_gaussians if trained else _points)(file, vertex)
 
 
 def _columns(file: MeshFile, vertex: Element, names: tuple[str, ...]) -> FloatArray:

@@ -7,10 +7,9 @@ formats of NeRF-synthetic (Mildenhall et al. 2020) and of instant-ngp and nerfst
 from __future__ import annotations
 
 import contextlib
-import functools
 import math
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -35,7 +34,7 @@ from npa_envs.tasks.targets.images import (
 )
 from npa_envs.tasks.targets.meshes import RADIUS, Mesh, draw_mesh, load_mesh
 from npa_envs.tasks.targets.notes import left_out
-from npa_envs.tasks.targets.splat_files import draw_splats, ply_kind, read_splats
+from npa_envs.tasks.targets.splat_files import GaussianCloud, draw_splats, ply_kind, read_splats
 
 DISTANCE = 3.2
 """Distance of cameras from the origin [length units]."""
@@ -114,36 +113,31 @@ def load_views(
     folder = home_path(source)
     if os.path.isdir(folder):
         return _read_view_folder(folder, resolution, training_count, held_out_count)
+    shape: GaussianCloud | Mesh
     if folder.suffix.lower() == ".ply" and folder.is_file() and ply_kind(folder) != "triangles":
-        splats = read_splats(folder)
-        draw = functools.partial(draw_splats, splats)
-        counted = (training_count, held_out_count)
-        return _views_around(draw, folder.stem, resolution, counted, splats.summary)
-    mesh = load_mesh(source)
-    return views_of_mesh(mesh, folder.stem, resolution, training_count, held_out_count)
+        shape = read_splats(folder)
+    else:
+        shape = load_mesh(source)
+    return drawn_views(shape, folder.stem, resolution, training_count, held_out_count)
 
 
-def views_of_mesh(
-    mesh: Mesh, name: str, resolution: int, training_count: int, held_out_count: int
-) -> ViewTarget:
-    """Return views of a mesh, which fits into the ball of radius 0.85, from cameras all around."""
-    counts = (training_count, held_out_count)
-    return _views_around(functools.partial(draw_mesh, mesh), name, resolution, counts, mesh.summary)
-
-
-def _views_around(
-    draw: Callable[[Cameras], Tensor | NDArray[np.float32]],
+def drawn_views(
+    shape: GaussianCloud | Mesh,
     name: str,
     resolution: int,
-    counts: tuple[int, int],
-    summary: str,
+    training_count: int,
+    held_out_count: int,
 ) -> ViewTarget:
-    """Return views that a function draws, to train with and held out, from cameras all around."""
+    """Return views of what fits into the ball of radius 0.85, from cameras all around."""
     views = []
-    for count, turn in zip(counts, (0.0, 0.5), strict=True):
+    for count, turn in ((training_count, 0.0), (held_out_count, 0.5)):
         cameras = surrounding_cameras(count, resolution, turn=turn)
-        views.append(Views(cameras, torch.as_tensor(draw(cameras))))
-    return ViewTarget(name, views[0], views[1], summary)
+        if isinstance(shape, Mesh):
+            pictures = torch.from_numpy(draw_mesh(shape, cameras))
+        else:
+            pictures = draw_splats(shape, cameras)
+        views.append(Views(cameras, pictures))
+    return ViewTarget(name, views[0], views[1], shape.summary)
 
 
 def surrounding_cameras(count: int, resolution: int, *, turn: float = 0.0) -> Cameras:
