@@ -351,13 +351,12 @@ def scaled_square(image: Image.Image, side: int) -> FloatImage:
 
 def require_opaque_pixels(image: Image.Image, *, label: str) -> None:
     """Raise NPAError, which calls the picture `label`, if no pixel has an alpha above one half."""
-    alpha = np.asarray(image.getchannel("A"))
-    if alpha.size == 0 or alpha.max() < OPAQUE:
-        highest = 0.0 if alpha.size == 0 else alpha.max() / 255
+    highest = np.asarray(image.getchannel("A")).max(initial=0)
+    if highest < OPAQUE:
         raise NPAError(
             f"target {shown(label)} must have pixels with alpha above 0.5, the highest is "
-            f"{highest:.2f} "
-            f"({image.width} x {image.height} pixels): give a picture that is not fully transparent"
+            f"{highest / 255:.2f} ({image.width} x {image.height} pixels): give a picture that is "
+            "not fully transparent"
         )
 
 

@@ -84,7 +84,9 @@ class MeshFile:
         except Exception as error:
             # Damaged files raise exceptions of many kinds.
             cause = f"{type(error).__name__}: {shown(error)}"
-            raise self.error(f"cannot be read as {what} ({cause}): save it again") from error
+            raise self.error(
+                f"cannot be read as {what} ({cause}): save it again, for example as .ply"
+            ) from error
 
     def left_out(self, text: str) -> None:
         """Warn of what was left out."""
