@@ -36,7 +36,7 @@ from npa_envs.rule.files import load_rule, save_rule
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.morphogenesis3d import Morphogenesis3D
 from npa_envs.tasks.targets.meshes import FloatArray, Mesh, load_mesh
-from npa_envs.tasks.targets.views import Views, composited, some_views, views_of_mesh
+from npa_envs.tasks.targets.views import Views, composited, drawn_views, some_views
 from npa_envs.tasks.train_config import TrainConfig
 from npa_envs.training import Trainer, override, preset
 from npa_envs.training.task_table import config_to_dict
@@ -355,7 +355,7 @@ def make_task(config: TrainConfig[Any], target: str, device: str) -> Morphogenes
     if target in UNSEEN:
         own = config.task
         counts = own.resolution, own.training_views, own.held_out_views
-        views = views_of_mesh(UNSEEN[target]().fitted(), target, *counts)
+        views = drawn_views(UNSEEN[target]().fitted(), target, *counts)
     return Morphogenesis3D(config.task, target=views, device=device)
 
 

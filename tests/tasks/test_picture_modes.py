@@ -8,7 +8,7 @@ import zlib
 
 import numpy as np
 import pytest
-from PIL import Image, ImageCms, features
+from PIL import Image, ImageCms, TiffImagePlugin, TiffTags, features
 
 from npa_envs.errors import MissingDependencyError, NPAError
 from npa_envs.tasks.targets.images import open_image, read_image
@@ -53,22 +53,18 @@ def write_tiff(path, samples, *, photometric=1, order="<", packed=False, planes=
     strips = [part.astype(samples.dtype.newbyteorder(order)).tobytes() for part in parts]
     strips = [zlib.compress(strip) for strip in strips] if packed else strips
     lengths = [len(strip) for strip in strips]
-    places = [8 + sum(lengths[:k]) for k in range(len(strips))]
+    # From the end of the directory, to which Pillow adds its place.
+    places = [sum(lengths[:k]) for k in range(len(strips))]
     values = {256: [width], 257: [height], 258: [8 * samples.dtype.itemsize] * count}
     values |= {259: [8 if packed else 1], 262: [photometric], 273: places, 277: [count]}
     values |= {278: [height], 279: lengths, 284: [planes], 339: [kind] * count}
     values |= {int(tag[1:]): value for tag, value in tags.items()}
-    body, later = b"".join(strips), b""
-    body += b"\0" * (len(body) % 2)
-    start = 8 + len(body)
-    directory, end = struct.pack(f"{order}H", len(values)), start + 2 + 12 * len(values) + 4
-    for tag, numbers in sorted(values.items()):
-        content = struct.pack(f"{order}{len(numbers)}I", *numbers)
-        if len(content) > 4:
-            later, content = later + content, struct.pack(f"{order}I", end + len(later))
-        directory += struct.pack(f"{order}HHI", tag, 4, len(numbers)) + content
-    head = (b"II*\0" if order == "<" else b"MM\0*") + struct.pack(f"{order}I", start)
-    path.write_bytes(head + body + directory + b"\0\0\0\0" + later)
+    head = (b"II*\0" if order == "<" else b"MM\0*") + struct.pack(f"{order}I", 8)
+    directory = TiffImagePlugin.ImageFileDirectory_v2(head)
+    for tag, numbers in values.items():
+        directory.tagtype[tag] = TiffTags.LONG
+        directory[tag] = numbers
+    path.write_bytes(head + directory.tobytes(8) + b"".join(strips))
 
 
 def pixels(path):
@@ -129,7 +125,7 @@ def test_grey_tiffs_are_scaled_by_their_depth_or_refused(
     write_tiff(path, samples, photometric=photometric, order=order, packed=packed)
     read_by_pillow = photometric == 1 or kind in ("u1", "f4") or (kind == "u2" and order == "<")
     if not read_by_pillow or (kind == "u4" and order == ">"):
-        with pytest.raises(NPAError, match=rf"TIFF of bits \({8 * dtype.itemsize},\).*PNG"):
+        with pytest.raises(NPAError, match="TIFF of a kind that Pillow does not read"):
             open_image(path)
         return
     rgba = pixels(path)
@@ -176,8 +172,8 @@ def test_floats_on_another_scale_and_kinds_that_pillow_cannot_read_are_named(tmp
     write_tiff(tmp_path / "c.tif", np.stack([levels] * 3, -1).astype("<f4"), photometric=2)
     for name, message in (
         ("a", "floats, of which 1 is white, .* the largest is 255: divide them"),
-        ("b", r"bits \(16,\), sample format \(3,\), photometric 1, which Pillow does not read"),
-        ("c", r"bits \(32, 32, 32\), sample format \(3, 3, 3\), photometric 2"),
+        ("b", "TIFF of a kind that Pillow does not read"),
+        ("c", "TIFF of a kind that Pillow does not read"),
     ):
         with pytest.raises(NPAError, match=message):
             open_image(tmp_path / f"{name}.tif")
@@ -194,36 +190,27 @@ def test_palettes_of_tiffs_with_8_bits_are_not_black(tmp_path):
 COLOUR = (0.25, 0.5, 1.0)
 
 
-@pytest.mark.parametrize("kind", ["u1", "u2"])
-@pytest.mark.parametrize("planes", [1, 2])
+@pytest.mark.parametrize(
+    ("colour", "kind", "planes", "packed"),
+    [([0.25], "u1", 1, False), *itertools.product([COLOUR], ["u1", "u2"], [1, 2], [False, True])],
+)
 @pytest.mark.parametrize("premultiplied", [False, True])
-@pytest.mark.parametrize("packed", [False, True])
 def test_alpha_of_tiffs_is_read_whether_or_not_colours_are_multiplied_by_it(
-    tmp_path, kind, planes, premultiplied, packed
+    tmp_path, colour, kind, planes, packed, premultiplied
 ):
     alpha = np.where(DISK, 0.75, 0.0)[..., None]
-    colours = np.array(COLOUR) * (alpha if premultiplied else DISK[..., None])
-    top = np.iinfo(kind).max
-    samples = (top * np.concatenate([colours, alpha], -1)).round().astype(kind)
-    kinds = {"photometric": 2, "planes": planes, "packed": packed}
+    colours = np.array(colour) * (alpha if premultiplied else DISK[..., None])
+    samples = (np.iinfo(kind).max * np.concatenate([colours, alpha], -1)).round().astype(kind)
+    kinds = {"photometric": {1: 1, 3: 2}[len(colour)], "planes": planes, "packed": packed}
     write_tiff(tmp_path / "disk.tif", samples, **kinds, t338=[2 - premultiplied])
     if planes == 2 and premultiplied and not packed:
         with pytest.raises(NPAError, match="of a kind that Pillow does not read"):
             open_image(tmp_path / "disk.tif")
         return
     rgba = pixels(tmp_path / "disk.tif")
-    assert abs(rgba[INSIDE] / 255 - (*COLOUR, 0.75)).max() < 2 / 255
+    shade = COLOUR if len(colour) == 3 else 3 * colour
+    assert abs(rgba[INSIDE] / 255 - (*shade, 0.75)).max() < 2 / 255
     assert (rgba[..., 3] > 0).tolist() == DISK.tolist()
-
-
-@pytest.mark.parametrize("premultiplied", [False, True])
-def test_grey_with_alpha_is_read(tmp_path, premultiplied):
-    alpha = np.where(DISK, 200, 0)
-    grey = np.where(DISK, 50 if premultiplied else 64, 0)
-    write_tiff(
-        tmp_path / "disk.tif", np.stack([grey, alpha], -1).astype("u1"), t338=[2 - premultiplied]
-    )
-    assert abs(pixels(tmp_path / "disk.tif")[INSIDE] - (64, 64, 64, 200)).max() <= 1
 
 
 # Colour profiles.

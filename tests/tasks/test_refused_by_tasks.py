@@ -106,7 +106,7 @@ def many(*targets, **fields):
         (lambda: load_target(Path("gecko")), "does not exist"),
         (lambda: load_target(Path(__file__).parent), "is a folder"),
         (lambda: load_texture("cels"), "did you mean 'cells'.*known: bubbles, cells, dots, drop"),
-        (lambda: load_texture(""), "for example 'cells'"),
+        (lambda: load_texture(""), "known: bubbles, cells"),
         (lambda: load_texture("missing.png"), "does not exist"),
         (lambda: load_texture("cells", resolution=0), "resolution must be an integer of at least"),
         (lambda: load_views("rocke"), "did you mean 'rocket'"),

@@ -210,10 +210,6 @@ def test_files_that_are_not_whole_are_refused_by_name(tmp_path, columns, message
     path = write_ply(tmp_path / "file.ply", columns)
     with pytest.raises(NPAError, match=message):
         load_views(path, resolution=8)
-
-
-def test_truncated_files_are_refused(tmp_path):
-    path = write_ply(tmp_path / "file.ply", random_gaussians(0)[0])
-    path.write_bytes(path.read_bytes()[:-200])
+    path.write_bytes(path.read_bytes()[:-8])
     with pytest.raises(NPAError, match="cannot be read as points or Gaussians"):
         load_views(path, resolution=8)

@@ -10,7 +10,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from npa_envs.errors import MissingDependencyError, NPAError
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2D, Morphogenesis2DConfig
-from npa_envs.tasks.targets import images, picture_points
+from npa_envs.tasks.targets import picture_points
 from npa_envs.tasks.targets.images import read_image, resample
 from npa_envs.tasks.targets.notes import left_out
 from npa_envs.tasks.targets.picture_points import builtin_targets, load_target, target_from_image
@@ -167,14 +167,9 @@ def test_whole_rectangle_is_grown_where_the_background_is_kept(tmp_path, mode):
     # Filters ring beside the edge, by a level or two of 255.
     assert (target.colours[left] - blue).abs().max() < 2.5 / 255
     assert (target.colours[right] - 1.0).abs().max() < 2.5 / 255
-
-
-def test_the_background_of_a_photograph_is_kept(tmp_path):
-    NOISE.crop((0, 0, 50, 40)).save(tmp_path / "photo.png")
-    fields = {"target": str(tmp_path / "photo.png"), "target_point_count": 500}
-    config = Morphogenesis2DConfig(**fields, keep_background=True)
-    assert len(Morphogenesis2D(config).target.points) == pytest.approx(500, rel=0.02)
-    assert load_target("heart", point_count=400, keep_background=True).colours.max() == 1.0
+    fields = {"target": str(tmp_path / "photo.png"), "target_point_count": 800}
+    task = Morphogenesis2D(Morphogenesis2DConfig(**fields, keep_background=True))
+    assert torch.equal(task.target.points, target.points)
 
 
 def test_the_background_is_what_is_connected_with_the_border(tmp_path):
@@ -191,30 +186,6 @@ def test_the_background_is_what_is_connected_with_the_border(tmp_path):
     image.save(tmp_path / "maze.png")
     alpha = np.asarray(read_image(tmp_path / "maze.png")[0])[..., 3]
     assert (alpha[np.asarray(image)[..., 0] == 255] == 0).all()
-
-
-def test_sixteen_bit_grey_is_scaled_not_clipped(tmp_path):
-    levels = np.full((40, 40), 65535, dtype=np.uint16)
-    levels[10:30, 10:30] = 16384
-    Image.fromarray(levels).save(tmp_path / "grey.png")
-    target = load_target(tmp_path / "grey.png", point_count=400)
-    assert (target.colours - 0.25).abs().max() < 0.02
-
-
-def test_picture_is_turned_as_its_exif_says(tmp_path):
-    image = Image.new("RGB", (80, 40), "white")
-    ImageDraw.Draw(image).rectangle((10, 10, 70, 30), fill=BLUE)
-    exif = Image.Exif()
-    exif[0x0112] = 6
-    image.save(tmp_path / "turned.jpg", exif=exif)
-    assert read_image(tmp_path / "turned.jpg")[0].size == (40, 80)
-
-
-def test_decompression_bomb_is_a_clear_error(tmp_path, monkeypatch):
-    disk_picture().save(tmp_path / "bomb.png")
-    monkeypatch.setattr(images, "MAX_AREA", 1000)
-    with pytest.raises(NPAError, match="at most 1000 pixels"):
-        load_target(tmp_path / "bomb.png")
 
 
 @pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() == 0, reason="root reads everything")

@@ -106,47 +106,29 @@ def test_targets_have_views_to_train_with_and_others_to_measure_by():
         assert float(alpha[:, 0].max()) == float(alpha[:, :, 0].max()) == 0.0
 
 
-def test_mesh_files_are_read_with_their_colours(tmp_path):
-    trimesh = pytest.importorskip("trimesh")
-    mesh = ball(colour=(0.2, 0.6, 1.0))
-    path = tmp_path / "ball.ply"
-    options = {"vertex_colors": np.tile((0.2, 0.6, 1.0), (len(mesh.vertices), 1)), "process": False}
-    trimesh.Trimesh(mesh.vertices, mesh.faces, **options).export(path)
-    read = load_mesh(path)
-    assert read.faces.shape == mesh.faces.shape
-    assert np.abs(read.colours - (0.2, 0.6, 1.0)).max() <= 1 / 255
-    assert np.linalg.norm(read.vertices, axis=1).max() == pytest.approx(RADIUS)
-    plain = tmp_path / "plain.stl"
-    trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).export(plain)
-    assert np.ptp(load_mesh(plain).colours) < 0.01
-    (tmp_path / "broken.ply").write_bytes(path.read_bytes()[:200])
-    with pytest.raises(NPAError, match=r"cannot be read as a mesh|must hold triangles"):
-        load_mesh(tmp_path / "broken.ply")
+def in_their_world(cameras, scale):
+    """Return cameras and the rocket where z is up, and the cameras' poses as files have them."""
+    mesh, turn = load_mesh("rocket"), torch.eye(4, dtype=torch.float64)
+    turn[:3, :3] = torch.tensor([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]])
+    poses = turn @ torch.linalg.inv(cameras.world_to_camera.double())
+    turned = dataclasses.replace(cameras, world_to_camera=torch.linalg.inv(poses).float())
+    z_up = mesh.vertices[:, [0, 2, 1]] * (1.0, -1.0, 1.0) * scale
+    backwards = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))
+    return turned, Mesh(z_up, mesh.faces, mesh.colours), (poses @ backwards).tolist()
 
 
 def nerf_folder(folder, side=40):
     """Write a NeRF-synthetic folder of a coloured mesh: z is up, cameras are at 4 units."""
-    mesh = load_mesh("rocket")
-    z_up = mesh.vertices[:, [0, 2, 1]] * (1.0, -1.0, 1.0) * 1.5
-    turned = Mesh(z_up, mesh.faces, mesh.colours)
     for split, count in (("train", 5), ("test", 3)):
-        # Poses in their world: ours turned.
         cameras = orbit(count, 25.0, 4.0, 50.0, width=side, height=side, azimuth=17.0)
-        back = torch.linalg.inv(cameras.world_to_camera.double())
-        turn = torch.eye(4, dtype=torch.float64)
-        turn[:3, :3] = torch.tensor([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]])
-        poses = turn @ back @ torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))
-        rotated = dataclasses.replace(
-            cameras, world_to_camera=torch.linalg.inv(turn @ back).float()
-        )
+        cameras, mesh, poses = in_their_world(cameras, 1.5)
         (folder / split).mkdir(parents=True)
         frames = []
-        for k, picture in enumerate(draw_mesh(turned, rotated)):
-            alpha = picture[..., 3:]
-            plain = np.concatenate((picture[..., :3] / alpha.clip(1e-6), alpha), axis=-1)
-            pixels = (255 * plain.clip(0, 1)).round().astype(np.uint8)
+        for k, picture in enumerate(draw_mesh(mesh, cameras)):
+            picture[..., :3] /= picture[..., 3:].clip(1e-6)
+            pixels = (255 * picture.clip(0, 1)).round().astype(np.uint8)
             Image.fromarray(pixels, "RGBA").save(folder / split / f"r_{k}.png")
-            frames.append({"file_path": f"./{split}/r_{k}", "transform_matrix": poses[k].tolist()})
+            frames.append({"file_path": f"./{split}/r_{k}", "transform_matrix": poses[k]})
         content = {"camera_angle_x": math.radians(50.0), "frames": frames}
         (folder / f"transforms_{split}.json").write_text(json.dumps(content), encoding="utf-8")
     return folder
@@ -185,25 +167,18 @@ def bent(u, v, lens):
 
 def ngp_folder(folder, lenses, *, background, suffix, in_frames=False, count=9):
     """Write opaque views of the rocket, of 90 x 60 pixels, as instant-ngp does."""
-    mesh = load_mesh("rocket")
-    z_up = Mesh(mesh.vertices[:, [0, 2, 1]] * (1.0, -1.0, 1.0), mesh.faces, mesh.colours)
-    turn = torch.tensor([[1.0, 0, 0, 0], [0, 0, -1.0, 0], [0, 1.0, 0, 0], [0, 0, 0, 1.0]])
     cameras = orbit(count, 25.0, 2.3, 50.0, width=90, height=60, azimuth=17.0)
-    poses = turn @ torch.linalg.inv(cameras.world_to_camera)
+    cameras, mesh, poses = in_their_world(cameras, 1.0)
     (folder / "images").mkdir(parents=True)
     frames = []
-    for k, pose in enumerate(poses):
+    for k, motion in enumerate(cameras.world_to_camera):
         lens = lenses[k % len(lenses)]
         # A pinhole's picture, of which each pixel of the lens's picture is a place.
-        numbers = torch.tensor([lens[name] for name in ("fl_x", "fl_y", "cx", "cy")])
+        numbers = 4.0 * torch.tensor([lens[name] for name in ("fl_x", "fl_y", "cx", "cy")])
         wide = dataclasses.replace(
-            cameras,
-            world_to_camera=torch.linalg.inv(pose)[None],
-            intrinsics=4.0 * numbers,
-            width=360,
-            height=240,
+            cameras, world_to_camera=motion[None], intrinsics=numbers, width=360, height=240
         )
-        pinhole = torch.from_numpy(draw_mesh(z_up, wide)[0])
+        pinhole = torch.from_numpy(draw_mesh(mesh, wide)[0])
         v, u = np.mgrid[0:60, 0:90] + 0.5
         straight_u, straight_v = u.copy(), v.copy()
         for _ in range(40):
@@ -216,8 +191,7 @@ def ngp_folder(folder, lenses, *, background, suffix, in_frames=False, count=9):
         pixels = 255 * (seen[..., :3] + (1 - seen[..., 3:]) * background).clamp(0, 1)
         name = f"images/{k:04}{suffix}"
         Image.fromarray(pixels.round().byte().numpy()).save(folder / name, quality=97)
-        motion = pose @ torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0]))
-        frames.append({"file_path": name, "transform_matrix": motion.tolist(), "sharpness": 9.0})
+        frames.append({"file_path": name, "transform_matrix": poses[k], "sharpness": 9.0})
         frames[-1] |= lens if in_frames else {}
     content = {"aabb_scale": 4, "frames": frames} | ({} if in_frames else lenses[0])
     (folder / "transforms.json").write_text(json.dumps(content), encoding="utf-8")

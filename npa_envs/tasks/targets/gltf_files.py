@@ -2,8 +2,8 @@
 
 trimesh neither multiplies factors with textures nor knows a second set of texture coordinates
 (case glb_factor_and_texture), makes all grey where parts are coloured in different ways
-(glb_parts_coloured_in_different_ways), and reads Draco parts as zeros, an instance alone and no
-fans (glb_extensions_that_are_required).
+(glb_parts_coloured_in_different_ways), and reads Draco parts as zeros, one of several instances and
+no fans (glb_extensions_that_are_required).
 """
 
 from __future__ import annotations
@@ -24,21 +24,20 @@ from npa_envs.tasks.targets.mesh_parts import (
     IntArray,
     MeshFile,
     Part,
-    strip,
 )
 from npa_envs.tasks.targets.meshes import FloatArray, Wrap, srgb_values
 
 _DRACO, _MESHOPT = "KHR_draco_mesh_compression", "EXT_meshopt_compression"
 _INSTANCES, _WEBP = "EXT_mesh_gpu_instancing", "EXT_texture_webp"
 _TRANSFORM, _GLOSS = "KHR_texture_transform", "KHR_materials_pbrSpecularGlossiness"
-_VISIBILITY = "KHR_node_visibility"
-_READ = (_INSTANCES, _WEBP, _TRANSFORM, _GLOSS, _VISIBILITY, "KHR_mesh_quantization")
+_READ = (_WEBP, _TRANSFORM, _GLOSS, "KHR_mesh_quantization")
 
 _APPEARANCE = ("KHR_materials_", "KHR_lights_", "KHR_animation_", "KHR_xmp", "EXT_lights_")
 """How the names of extensions begin without which shape and colour are nearly right."""
 
 _COMPONENTS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
 _KINDS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
+_LINES = (0, 1, 2, 3)  # modes of points and lines
 _WRAPS: dict[Any, Wrap] = {33648: "mirror", 33071: "clamp"}
 _MAX_VALUES = 2**27
 _MAX_PARTS = 2**16
@@ -181,9 +180,9 @@ class _Gltf:
         below = {child for node in nodes for child in node.get("children", [])}
         roots = [k for k in range(len(nodes)) if k not in below]
         scene = self._item("scenes", self.root.get("scene", 0)) if scenes else {"nodes": roots}
-        self.file.count_left_out(len(scenes) - 1, "scene", "scenes")
-        self.file.count_left_out(len(self.root.get("animations", [])), "animation", "animations")
-        read = (*_READ, _DRACO, _MESHOPT)
+        self.file.count_left_out(len(scenes) - 1, "scene(s)")
+        self.file.count_left_out(len(self.root.get("animations", [])), "animation(s)")
+        read = (*_READ, _DRACO, _MESHOPT, _INSTANCES)
         used = [name for name in self.root.get("extensionsUsed", []) if name not in read]
         if used:
             self.file.left_out(f"what {shown(', '.join(used))} would change")
@@ -200,29 +199,22 @@ class _Gltf:
                     f"must have nodes that form a tree, node {index} is in a loop"
                 )
             self.world[index] = outer @ _local(node)
-            visible = visible and _extension(node, _VISIBILITY).get("visible", True)
             if visible and "mesh" in node:
                 drawn.append(node | {"place": self.world[index]})
             stack += [(k, self.world[index], visible) for k in reversed(node.get("children", []))]
-        if not nodes:
-            drawn = [
-                {"mesh": k, "place": np.eye(4)} for k in range(len(self.root.get("meshes", [])))
-            ]
         return [part for node in drawn for part in self._parts_of(node)]
 
     def _parts_of(self, node: dict[str, Any]) -> list[Part]:
-        """Return the parts of a node's mesh, each with all instances of it."""
-        places, mesh, parts = node["place"][None], self._item("meshes", node["mesh"]), []
-        if instances := _extension(node, _INSTANCES).get("attributes"):
-            rows = ("TRANSLATION", "ROTATION", "SCALE")
-            each = (self._values(instances[k]) if k in instances else None for k in rows)
-            places = node["place"] @ _placed(*each)
-        if "skin" in node:
-            # The joints say where the vertices are.
-            places = np.eye(4)[None]
+        """Return the parts of a node's mesh."""
+        if _extension(node, _INSTANCES):
+            raise self._refused(_INSTANCES)
+        # The joints of a skin say where the vertices are.
+        place = np.eye(4) if "skin" in node else node["place"]
+        # What is mirrored must not be turned inside out.
+        order = (2, 1, 0) if np.linalg.det(place[:3, :3]) < 0 else (0, 1, 2)
+        mesh, parts = self._item("meshes", node["mesh"]), []
         modes = [primitive.get("mode", 4) for primitive in mesh["primitives"]]
-        lines = sum(mode in (0, 1, 2, 3) for mode in modes)
-        self.file.count_left_out(lines, "part of points or lines", "parts of points or lines")
+        self.file.count_left_out(sum(k in _LINES for k in modes), "part(s) of points or lines")
         for k, primitive in enumerate(mesh["primitives"]):
             key = (node["mesh"], k)
             if key not in self.known or "skin" in node or "weights" in node:
@@ -230,19 +222,13 @@ class _Gltf:
             part = self.known[key]
             if part is None:
                 continue
-            self.triangles += len(part.faces) * len(places)
+            self.triangles += len(part.faces)
             self.part_count += 1
             if self.triangles > MAX_TRIANGLES or self.part_count > _MAX_PARTS:
                 raise self._too_large()
-            # What is mirrored must not be turned inside out.
-            order = np.where(np.linalg.det(places[:, :3, :3])[:, None] < 0, (2, 1, 0), (0, 1, 2))
-            where = order[:, None] + 3 * np.arange(len(part.faces))[:, None]
-            starts = len(part.vertices) * np.arange(len(places))[:, None, None]
-            points = part.vertices @ places[:, :3, :3].mT + places[:, None, :3, 3]
-            faces = (part.faces.reshape(-1)[where] + starts).reshape(-1, 3)
-            colours = part.colours.reshape(-1, 3)[where].reshape(-1, 3, 3)
-            uv = part.uv.reshape(-1, 2)[where].reshape(-1, 3, 2)
-            parts.append(Part(points.reshape(-1, 3), faces, colours, uv, part.texture))
+            points = part.vertices @ place[:3, :3].T + place[:3, 3]
+            faces, colours, uv = part.faces[:, order], part.colours[:, order], part.uv[:, order]
+            parts.append(Part(points, faces, colours, uv, part.texture))
         return parts
 
     def _part(
@@ -251,7 +237,7 @@ class _Gltf:
         """Return the triangles of a primitive, None if it has none or is invisible."""
         attributes = primitive["attributes"]
         if mode not in (4, 5, 6) or "POSITION" not in attributes:
-            if mode not in (0, 1, 2, 3):
+            if mode not in _LINES:
                 self.file.left_out(f"a part of mode {shown(mode)}, or without positions")
             return None
         position = attributes["POSITION"]
@@ -262,15 +248,18 @@ class _Gltf:
         corners = np.arange(len(raw))
         if "indices" in primitive:
             corners = self._raw(primitive["indices"])[:, 0].astype(np.int64)
+        first, second, third = (corners[k : k - 2 or None] for k in range(3))
         if mode == 5:
-            triangles = strip(corners)
+            # Every other triangle of a strip turns the other way.
+            odd = np.arange(len(first)) % 2 == 1
+            first, second = np.where(odd, second, first), np.where(odd, first, second)
         elif mode == 6:
-            hub = np.repeat(corners[:1], max(0, len(corners) - 2))
-            triangles = np.stack((hub, corners[1:-1], corners[2:]), axis=1)
+            first = np.repeat(corners[:1], len(second))
         else:
             more = len(corners) % 3
-            self.file.count_left_out(more, "corner too many", "corners too many")
-            triangles = corners[: len(corners) - more].reshape(-1, 3)
+            self.file.count_left_out(more, "corner(s) too many")
+            first, second, third = corners[: len(corners) - more].reshape(-1, 3).T
+        triangles = np.stack((first, second, third), axis=1)
         self.file.check_corners(raw, triangles)
         used, faces = np.unique(triangles, return_inverse=True)
         points, targets = self._values(position, used), primitive.get("targets", [])
@@ -378,27 +367,14 @@ def _local(node: dict[str, Any]) -> FloatArray:
     """Return the motion of a node in the one above it, [4, 4]."""
     if "matrix" in node:
         return np.array(node["matrix"], dtype=np.float64).reshape(4, 4).T
-    keys = ("translation", "rotation", "scale")
-    each = (np.array(node[key], dtype=np.float64)[None] if key in node else None for key in keys)
-    placed: FloatArray = _placed(*each)[0]
-    return placed
-
-
-def _placed(t: FloatArray | None, q: FloatArray | None, s: FloatArray | None) -> FloatArray:
-    """Return motions [I, 4, 4] that scale by s, rotate by quaternions q (x y z w), move by t."""
-    motions = np.tile(
-        np.eye(4), (max(1 if each is None else len(each) for each in (t, q, s)), 1, 1)
+    turn = np.array(node.get("rotation", (0, 0, 0, 1)), dtype=np.float64)
+    x, y, z, w = turn / np.linalg.norm(turn)
+    rows = (
+        (1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)),
+        (2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)),
+        (2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)),
     )
-    if q is not None:
-        x, y, z, w = (q / np.linalg.norm(q, axis=1, keepdims=True)).T
-        rows = (
-            (1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)),
-            (2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)),
-            (2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)),
-        )
-        motions[:, :3, :3] = np.array(rows).transpose(2, 0, 1)
-    if s is not None:
-        motions[:, :3, :3] *= s[:, None]
-    if t is not None:
-        motions[:, :3, 3] = t
-    return motions
+    motion: FloatArray = np.eye(4)
+    motion[:3, :3] = np.array(rows) * np.array(node.get("scale", (1, 1, 1)), dtype=np.float64)
+    motion[:3, 3] = node.get("translation", (0, 0, 0))
+    return motion

@@ -1,4 +1,4 @@
-"""Picture files of targets: reading, removal of plain backgrounds, scaling."""
+"""Picture files of targets as RGBA in sRGB: reading, removal of plain backgrounds, scaling."""
 
 from __future__ import annotations
 
@@ -7,14 +7,15 @@ import math
 import os
 import warnings
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image, UnidentifiedImageError, features
+from PIL import Image, ImageFile, ImageOps, UnidentifiedImageError, features
 
 from npa_envs.atomic_files import read_bytes
 from npa_envs.errors import MissingDependencyError, NPAError, importing, shown
-from npa_envs.tasks.targets.picture_modes import Mask, correct_tiles, kind_of_tiff, to_rgba
+from npa_envs.tasks.targets.notes import left_out
 
 OPAQUE = 128
 """Minimum alpha of a pixel that belongs to a target, out of 255."""
@@ -44,6 +45,22 @@ MAX_POINT_COUNT = 2**24
 """Maximum number of points of a target."""
 
 FloatImage = NDArray[np.float32]
+Mask = NDArray[np.bool_]
+
+BRIGHT = 2.0
+"""Floats of which most positive ones are above this are not on a scale where 1 is white."""
+
+DARK = 0.25
+"""Pictures of more than 8 bits whose largest value is below this, where 1 is white, are told of."""
+
+_CLIPPED = 1.0 + 0.5 / 255.0
+_SRGB_GAMMA = 1.0 / 2.2
+_MODES_OF_PROFILES = {"RGB": "RGB", "GRAY": "L", "CMYK": "CMYK", "Lab": "LAB"}
+# Tags of TIFF.
+_BITS, _PHOTOMETRIC, _PLANES, _COLOURS, _SUBFILES, _SAMPLE_FORMAT = 258, 262, 284, 320, 330, 339
+_SEPARATE = 2  # of _PLANES
+_SIGNED, _FLOAT = 2, 3  # of _SAMPLE_FORMAT
+_NATIVE_MODES = {"F;32BF": "F;32NF", "I;32BS": "I;32NS", "I;16BS": "I;16NS"}
 
 
 def read_image(path: Path, *, keep_background: bool = False) -> tuple[Image.Image, str]:
@@ -102,21 +119,20 @@ def decode_image(content: bytes, *, label: str) -> Image.Image:
             warnings.simplefilter("ignore")
             with Image.open(io.BytesIO(content), formats=_formats(content, name)) as opened:
                 _check_area(opened.size, name)
-                correct_tiles(opened)
+                _correct_tiles(opened)
                 opened.load()
                 # A format inside of another may have another size.
                 _check_area(opened.size, name)
-                return to_rgba(opened, content, label)
+                return _to_rgba(opened, content, label)
     except Image.DecompressionBombError as error:
         raise _too_large(name, "more") from error
     except UnidentifiedImageError as error:
-        if kind := kind_of_tiff(content):
-            raise NPAError(
-                f"target {name} is a {kind}, which Pillow does not read, or damaged: save it as PNG"
-            ) from error
+        what = "none of these"
+        if content[:4] in (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"):
+            what = "a TIFF of a kind that Pillow does not read, or damaged"
         raise NPAError(
             f"target {name} must be a picture ({', '.join(FORMATS)}, AVIF, HEIC), "
-            "but its content is none of these: save it as PNG"
+            f"but its content is {what}: save it as PNG"
         ) from error
     except NPAError:
         raise
@@ -133,9 +149,7 @@ def _formats(content: bytes, name: str) -> tuple[str, ...]:
 
     Raise MissingDependencyError for AVIF or HEIC where what reads it is missing.
     """
-    if content[4:8] != b"ftyp":
-        return FORMATS
-    brands = content[8 : int.from_bytes(content[:4], "big")]
+    brands = content[8 : int.from_bytes(content[:4], "big")] if content[4:8] == b"ftyp" else b""
     if b"avif" in brands or b"avis" in brands:
         if not features.check("avif"):
             raise MissingDependencyError(
@@ -163,6 +177,163 @@ def _too_large(name: str, got: str) -> NPAError:
     )
 
 
+# Pixels: bit depths, floats, transparent colours, profiles.
+
+
+def _to_rgba(opened: ImageFile.ImageFile, content: bytes, name: str) -> Image.Image:
+    """Return a loaded picture as RGBA, upright, in sRGB; `content` has the bytes of its file.
+
+    Samples are scaled by the file's bit depth; white is 1 for floats. A colour that a PNG names
+    transparent becomes so, and so does NaN. An embedded colour profile is applied. What is not
+    used is told by `left_out`, which calls the file `name`.
+    """
+    tags: Any = getattr(opened, "tag_v2", {})
+    kind = tags.get(_SAMPLE_FORMAT, (_FLOAT if opened.mode == "F" else 1,))[0]
+    if getattr(opened, "is_animated", False) or _SUBFILES in tags:
+        left_out(name, "all its frames, pages or pictures but the first")
+    is_png = opened.format == "PNG"
+    image = ImageOps.exif_transpose(opened)
+    palette = tags.get(_COLOURS, ()) if image.mode == "P" else ()
+    if 0 < max(palette, default=0) < 256:
+        # Some programs write colours of 8 bits, of which Pillow takes the upper half of 16.
+        image.putpalette(np.array(palette, np.uint8).reshape(3, -1).T.tobytes())
+    there = _not_transparent(image, content) if is_png else None
+    if image.mode.startswith("I") or image.mode == "F" or kind == _SIGNED:
+        # Pillow scales the samples of PGM files to 16 bits, and inverts up to 8 bits only.
+        bits, inverted = tags.get(_BITS, (16,))[0], tags.get(_PHOTOMETRIC) == 0
+        image, numbers = _to_eight_bits(image, kind, bits, inverted, name)
+        there = numbers if there is None else there & numbers
+    if image.mode == "La":
+        image = image.convert("LA")
+    rgba = image.convert("RGB" if image.mode in ("LAB", "CMYK") else "RGBA").convert("RGBA")
+    if image.info.get("icc_profile"):
+        grey, other = image.mode in ("1", "L", "LA"), image.mode in ("LAB", "CMYK")
+        own = image.convert("L") if grey else image if other else rgba.convert("RGB")
+        if (colours := _in_srgb(own, image.info["icc_profile"], name)) is not None:
+            colours.putalpha(rgba.getchannel("A"))
+            rgba = colours
+    elif is_png and "srgb" not in image.info:
+        gamma = image.info.get("gamma", _SRGB_GAMMA)
+        if abs(gamma / _SRGB_GAMMA - 1.0) > 0.05:
+            left_out(name, f"its gamma of {gamma:g}; colours are read as sRGB")
+    if there is not None:
+        alpha = np.asarray(rgba.getchannel("A")) * there
+        rgba.putalpha(Image.fromarray(alpha.astype(np.uint8)))
+    return rgba
+
+
+def _correct_tiles(opened: ImageFile.ImageFile) -> None:
+    """Correct, before a TIFF is loaded, how Pillow unpacks samples of more than 8 bits.
+
+    It swaps the bytes of big-endian ones that libtiff has swapped before, and takes planes of 16
+    bits, where they are not compressed, for planes of 8.
+    """
+    tags: Any = getattr(opened, "tag_v2", {})
+    planes = tags.get(_PLANES) == _SEPARATE and max(tags.get(_BITS, (1,))) == 16
+    tiles: list[Any] = opened.tile if tags else []
+    for k, tile in enumerate(tiles):
+        mode, *others = tile.args
+        if tile.codec_name == "libtiff":
+            mode = _NATIVE_MODES.get(mode, mode)
+        elif planes and len(mode) == 1:
+            mode += ";16B" if tags.prefix == b"MM" else ";16L"
+        tiles[k] = tile._replace(args=(mode, *others))
+
+
+def _to_eight_bits(
+    image: Image.Image, kind: int, bits: int, inverted: bool, name: str
+) -> tuple[Image.Image, Mask]:
+    """Return a grey picture in 8 bits, and where its samples are numbers.
+
+    The samples' `kind` is 1 for unsigned integers, else `_SIGNED` or `_FLOAT`. White is their
+    largest value, 1 for floats, or 0 if they are `inverted`.
+    """
+    white = 1.0 if kind == _FLOAT else 2.0 ** (bits - (kind == _SIGNED)) - 1.0
+    stored = np.asarray(image)
+    if image.mode == "L":
+        stored = stored.view(np.int8)
+    levels = stored.astype(np.float64)
+    if white >= 2.0**31 and kind != _SIGNED:
+        # Pillow reads unsigned samples of 32 bits as signed ones.
+        levels %= 2.0**32
+    levels /= white
+    numbers = ~np.isnan(levels)
+    values = levels[numbers]
+    largest = float(values.max(initial=0.0))
+    if kind == _FLOAT and 2 * (values > BRIGHT).sum() > (values > 0.0).sum():
+        raise NPAError(
+            f"target {shown(name)} has floats, of which 1 is white, but most of its values above 0 "
+            f"are above {BRIGHT:g}, and the largest is {largest:g}: divide them by their white, or "
+            "save it with 8 or 16 bits"
+        )
+    for outside, text in (
+        (~numbers, "what is no number (NaN) and becomes transparent"),
+        (values > _CLIPPED, f"values above 1, up to {largest:g}, which become white"),
+        (values < 0.0, "negative values, which become black"),
+    ):
+        if outside.any():
+            left_out(name, f"{text}, at {outside.sum()} of {outside.size} pixels")
+    if inverted:
+        levels = 1.0 - levels
+    elif 0.0 < largest < DARK:
+        text = f"its largest value is {largest * white:g} of {white:.10g}: scale its values"
+        left_out(name, text, what="dark")
+    levels = np.where(numbers, levels, 0.0) * 255.0
+    grey = Image.fromarray(levels.clip(0, 255).astype(np.uint8))
+    grey.info = image.info
+    return grey, numbers
+
+
+def _not_transparent(image: Image.Image, content: bytes) -> Mask | None:
+    """Return where a PNG's pixels have another colour than the transparent one of tRNS, [H, W].
+
+    None: Pillow makes them transparent itself. It compares grey of 2 and 4 bits, which it has
+    scaled, and colours of 16 bits, which it has cut to 8, with the unscaled number in the file.
+    """
+    transparent, depth = image.info.get("transparency"), content[24]
+    if transparent is None or image.mode == "P":
+        return None
+    if depth < 16:
+        if image.mode == "L" and transparent < 2**depth:
+            image.info["transparency"] = transparent * (255 // (2**depth - 1))
+        return None
+    del image.info["transparency"]
+    samples = np.asarray(image)
+    if image.mode == "RGB":
+        with Image.open(io.BytesIO(content), formats=("PNG",)) as low:
+            # The same decoder, told that the other byte of each sample is the higher one.
+            low.tile = [tile._replace(args="RGB;16L") for tile in low.tile]
+            lower = np.asarray(ImageOps.exif_transpose(low))
+        samples = samples.astype(np.uint16) * 256 + lower
+    different = samples.reshape(*samples.shape[:2], -1) != np.array(transparent)
+    return np.asarray(different.any(axis=-1))
+
+
+def _in_srgb(image: Image.Image, profile: bytes, name: str) -> Image.Image | None:
+    """Return a picture as RGB by its ICC profile; None, and a line that says so, if it is no use.
+
+    The picture's mode is L, RGB, CMYK or LAB.
+    """
+    try:
+        from PIL import ImageCms
+
+        source = ImageCms.ImageCmsProfile(io.BytesIO(profile))
+        space = source.profile.xcolor_space.strip()
+        if space == "RGB" and image.mode == "L":
+            image = image.convert("RGB")
+        if _MODES_OF_PROFILES.get(space) != image.mode:
+            raise ValueError(f"it is for {space}, the picture is {image.mode}")
+        target = ImageCms.createProfile("sRGB")
+        return ImageCms.profileToProfile(image, source, target, outputMode="RGB")
+    except Exception as error:
+        # A Pillow without littleCMS, and damaged profiles, of which it reports many kinds.
+        left_out(name, f"its colour profile ({shown(error)})")
+        return None
+
+
+# Shapes.
+
+
 def looks_like_path(source: str) -> bool:
     """Return whether text contains a folder or a suffix, or is the path of an existing file."""
     if "/" in source or "\\" in source or Path(source).suffix:
@@ -180,13 +351,12 @@ def scaled_square(image: Image.Image, side: int) -> FloatImage:
 
 def require_opaque_pixels(image: Image.Image, *, label: str) -> None:
     """Raise NPAError, which calls the picture `label`, if no pixel has an alpha above one half."""
-    alpha = np.asarray(image.getchannel("A"))
-    if alpha.size == 0 or alpha.max() < OPAQUE:
-        highest = 0.0 if alpha.size == 0 else alpha.max() / 255
+    highest = np.asarray(image.getchannel("A")).max(initial=0)
+    if highest < OPAQUE:
         raise NPAError(
             f"target {shown(label)} must have pixels with alpha above 0.5, the highest is "
-            f"{highest:.2f} "
-            f"({image.width} x {image.height} pixels): give a picture that is not fully transparent"
+            f"{highest / 255:.2f} ({image.width} x {image.height} pixels): give a picture that is "
+            "not fully transparent"
         )
 
 

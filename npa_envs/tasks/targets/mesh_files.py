@@ -1,12 +1,13 @@
-"""Mesh files as meshes with colours and textures; in this file PLY, OFF and STL."""
+"""Mesh files as meshes with colours and textures; in this file PLY, OBJ, OFF and STL."""
 
 from __future__ import annotations
 
 import functools
 import io
+import math
 import re
-import struct
 import warnings
+from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -15,18 +16,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from npa_envs.atomic_files import read_bytes
-from npa_envs.errors import NPAError, importing, shown
+from npa_envs.errors import importing, shown
 from npa_envs.tasks.targets.gltf_files import read_gltf
 from npa_envs.tasks.targets.mesh_parts import (
     MAX_TRIANGLES,
     IntArray,
     MeshFile,
     Part,
-    strip,
     unit_colours,
 )
 from npa_envs.tasks.targets.meshes import MAX_FILE, FloatArray, Mesh
-from npa_envs.tasks.targets.obj_files import read_obj
 
 _MAX_UV = 1e6
 _SIZE_RANGE = 1e-30, 1e30
@@ -42,17 +41,8 @@ def read_mesh(path: Path) -> Mesh:
     file = MeshFile(path)
     if not content:
         raise file.error("is an empty file (0 bytes): save the mesh again")
-    try:
-        with np.errstate(all="ignore"):
-            return _joined(file, _READERS[path.suffix.lower()](file, content))
-    except NPAError:
-        raise
-    except Exception as error:
-        # Damaged files raise exceptions of many kinds.
-        raise file.error(
-            f"cannot be read as a mesh ({type(error).__name__}: {shown(error)}): save it again, "
-            "for example as .ply or .glb"
-        ) from error
+    with file.reading("a mesh"):
+        return _joined(file, _READERS[path.suffix.lower()](file, content))
 
 
 def _joined(file: MeshFile, parts: list[Part]) -> Mesh:
@@ -78,8 +68,7 @@ def _joined(file: MeshFile, parts: list[Part]) -> Mesh:
     )
     colours, uv = (np.concatenate([getattr(p, key) for p in parts]) for key in ("colours", "uv"))
     lost = (texture_of_face >= 0) & ~np.isfinite(uv).all(axis=(1, 2))
-    what = "texture of {}, without coordinates in it"
-    file.count_left_out(int(lost.sum()), what.format("triangle"), what.format("triangles"))
+    file.count_left_out(int(lost.sum()), "texture of triangle(s), without coordinates in it")
     texture_of_face[lost] = -1
     colours[(texture_of_face >= 0)[:, None, None] & np.isnan(colours)] = 1.0
     plain = ~np.isfinite(colours).all(axis=(1, 2))
@@ -183,10 +172,7 @@ def _read_rows(
         return np.dtype(np.float64 if order == "=" else order + _PLY_TYPES[kind])
 
     keys, kinds = [key for key, _, _ in properties], [stored(kind) for _, _, kind in properties]
-    counters = [
-        struct.Struct(order + stored(c).char.replace("l", "q")) if c else None
-        for _, c, _ in properties
-    ]
+    counters = [stored(counted) if counted else None for _, counted, _ in properties]
     if not any(counters):
         fields = list(zip(keys, kinds, strict=True))
         rows = np.frombuffer(data, fields, count, start) if count else np.empty(0, fields)
@@ -200,8 +186,8 @@ def _read_rows(
             for counter, kind, found, sizes in plan:
                 length = 1
                 if counter is not None:
-                    length = int(counter.unpack_from(data, end)[0])
-                    end += counter.size
+                    length = int(np.frombuffer(data, counter, 1, end)[0])
+                    end += counter.itemsize
                 start, end = end, end + length * kind.itemsize
                 if not start <= end <= len(data):
                     raise ValueError("it ends too early")
@@ -226,8 +212,10 @@ def ply_colours(file: MeshFile, element: dict[str, PlyProperty]) -> FloatArray |
 
 
 def _read_ply_parts(file: MeshFile, content: bytes) -> list[Part]:
-    """Return the parts of a PLY file, one for each texture, and one for strips of triangles."""
+    """Return the parts of a PLY file, one for each texture."""
     elements, comments = read_ply(content)
+    if "tristrips" in elements:
+        raise file.error("has strips of triangles (tristrips), which are not read: save faces")
     vertex, face = elements.get("vertex", {}), elements.get("face", {})
     vertices = np.stack([vertex[key].values.astype(np.float64) for key in "xyz"], axis=1)
     nothing = PlyProperty(np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64))
@@ -255,21 +243,157 @@ def _read_ply_parts(file: MeshFile, content: bytes) -> list[Part]:
             name = names[int(number)]
             read = functools.partial(file.neighbour, name)
             texture = file.texture(name, read, ("repeat", "repeat"))
-        part = Part(vertices, faces[chosen], None if colours is None else colours[chosen])
-        if texture is not None and uv is not None:
+        if texture is None or uv is None:
+            part = Part(vertices, faces[chosen], None if colours is None else colours[chosen])
+        else:
             if colours is not None:
                 file.left_out("colours where there is a texture")
             # In this format v goes up.
             flipped = uv[chosen] * (1.0, -1.0) + (0.0, 1.0)
             part = Part(vertices, faces[chosen], None, flipped, texture.texture)
         parts.append(part)
-    if "tristrips" in elements:
-        values = elements["tristrips"]["vertex_indices"].values.astype(np.int64)
-        runs = np.split(values, np.flatnonzero(values == -1))
-        faces = np.concatenate([strip(run[run != -1]) for run in runs])
-        file.check_corners(vertices, faces)
-        parts.append(Part(vertices, faces, None if at_corners is None else at_corners[faces]))
     return parts
+
+
+# OBJ and its materials in MTL. trimesh counts negative indices from the end of the file (case
+# obj_relative_indices_between_vertices), cuts polygons as if they were convex, and fails with
+# texture coordinates but no texture (case mesh_one_plain_material).
+
+_NOT_DRAWN = {"p": "element(s) of points", "l": "element(s) of lines", "curv": "free-form curve(s)"}
+_NOT_DRAWN["surf"] = "free-form surface(s)"
+_OPTIONS = re.compile(r"(-\S+\s+((on|off|[rgbmlz]|[-+]?[.\d]\S*)\s+)*)*", re.IGNORECASE)
+"""The options before the file of a texture."""
+
+
+def _index(text: str, count: int) -> int:
+    """Return an index from 0; negative ones count back from the last row before the line."""
+    index = int(text)
+    if index == 0 or index < -count:
+        raise ValueError(f"index {index} after {count} rows")
+    return index - 1 if index > 0 else count + index
+
+
+def _lines(content: bytes) -> list[list[str]]:
+    """Return the words of the lines of a text, without comments; continued lines are joined."""
+    code = "utf-16" if content[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig"
+    text = re.sub(r"\r\n?", "\n", content.decode(code, errors="replace")).replace("\\\n", " ")
+    lines = (re.sub(r"(^|\s)#.*", "", row) if "#" in row else row for row in text.split("\n"))
+    return [line.split() for line in lines]
+
+
+def _read_obj(file: MeshFile, content: bytes) -> list[Part]:
+    """Return the parts of an OBJ file, one for each material."""
+    rows: list[list[float]] = []
+    uv: list[list[float]] = []
+    of_corners: list[tuple[int, int]] = []
+    of_polygons: list[tuple[int, int]] = []
+    names, material, libraries, not_drawn = {"": 0}, 0, [], Counter[str]()
+    for number, words in enumerate(_lines(content), 1):
+        try:
+            match words:
+                case ["v", *rest]:
+                    x, y, z, *more = map(float, rest)
+                    # Four numbers are homogeneous coordinates, six or more have a colour.
+                    scale = more[0] if len(more) == 1 and more[0] else 1.0
+                    shade = more[:3] if len(more) > 2 else [math.nan] * 3
+                    rows.append([x / scale, y / scale, z / scale, *shade])
+                case ["vt", *rest]:
+                    uv.append([float(rest[0]), float(rest[1]) if len(rest) > 1 else 0.0])
+                case ["f" | "fo", *rest]:
+                    for corner in rest:
+                        vertex, place, *_ = [*corner.split("/"), ""]
+                        index = _index(place, len(uv)) if place else -1
+                        of_corners.append((_index(vertex, len(rows)), index))
+                    of_polygons.append((len(rest), material))
+                case ["usemtl", *rest]:
+                    material = names.setdefault(" ".join(rest), len(names))
+                case ["mtllib", *rest]:
+                    libraries.append(" ".join(rest))
+                case [word, *_] if word in _NOT_DRAWN:
+                    not_drawn[word] += 1
+        except (ValueError, IndexError) as error:
+            line = f"line {number}, {shown(' '.join(words))}"
+            raise file.error(f"has an unreadable {line} ({error}): save it again") from error
+    for word, things in _NOT_DRAWN.items():
+        file.count_left_out(not_drawn[word], things)
+    vertices, shades = np.split(np.array(rows, dtype=np.float64).reshape(-1, 6), 2, axis=1)
+    corners, uv_indices = np.array(of_corners, dtype=np.int64).reshape(-1, 2).T
+    counts, materials_of = np.array(of_polygons, dtype=np.int64).reshape(-1, 2).T
+    if uv_indices.max(initial=-1) >= len(uv):
+        raise file.error(f"has more texture coordinates in faces than its {len(uv)} rows of vt")
+    places, polygons = file.polygons(vertices, corners, counts)
+    faces, of_faces, shades = corners[places], materials_of[polygons], unit_colours(shades)
+    places_in_textures = np.array([*uv, [np.nan] * 2])[uv_indices[places]]
+    materials = _read_materials(file, libraries)
+    parts = []
+    for name, index in names.items():
+        chosen = of_faces == index
+        if chosen.any():
+            part = Part(vertices, faces[chosen], shades[faces[chosen]])
+            if name in materials:
+                file.materials.add(name)
+                _apply(file, materials[name], part, places_in_textures[chosen])
+            elif name:
+                file.left_out(f"the material {shown(name)}, which no .mtl file here has")
+            parts.append(part)
+    return parts
+
+
+def _read_materials(file: MeshFile, libraries: list[str]) -> dict[str, dict[str, list[str]]]:
+    """Return the words of each property of the materials in the MTL files of an OBJ file."""
+    materials: dict[str, dict[str, list[str]]] = {}
+    for library in dict.fromkeys(libraries):
+        # A line may name one file with spaces, or several files.
+        for name in [library] if file.neighbour(library) is not None else library.split():
+            content, material = file.neighbour(name), {}
+            if content is None:
+                file.left_out(f"the materials of {shown(name)}, which is not there")
+            for words in filter(None, _lines(content or b"")):
+                if words[0] == "newmtl":
+                    material = materials.setdefault(" ".join(words[1:]), {})
+                else:
+                    material[words[0].lower()] = words[1:]
+    return materials
+
+
+def _apply(file: MeshFile, material: dict[str, list[str]], part: Part, uv: FloatArray) -> None:
+    """Give the colour and texture of its material to a part with these texture coordinates."""
+    try:
+        # One number stands for all three.
+        colour, light = (
+            [min(max(float(word), 0.0), 1.0) for word in (3 * material.get(key, []))[:3]]
+            for key in ("kd", "ke")
+        )
+        alpha = [
+            float(words[-1]) - k
+            for k, words in ((1, material.get("d")), (0, material.get("tr")))
+            if words
+        ]
+    except ValueError:
+        file.left_out("colours that are no numbers")
+        colour, light, alpha = [], [], []
+    texture, line = None, " ".join(material.get("map_kd", []))
+    name = _OPTIONS.sub("", line, count=1)
+    if name:
+        texture = file.texture(name, lambda: file.neighbour(name), ("repeat", "repeat"))
+    if texture is not None:
+        part.texture = texture.texture
+        # In this format v goes up.
+        part.uv = uv * (1.0, -1.0) + (0.0, 1.0)
+        if name != line:
+            file.left_out(f"options of the texture {shown(line)}")
+        if np.isfinite(part.colours).any():
+            file.left_out("colours of corners where there is a texture")
+        if colour and not any(colour):
+            file.left_out("black of a material with a texture, as it would hide that")
+        part.colours = np.full(part.colours.shape, colour if any(colour) else 1.0)
+    elif colour:
+        if any(light) and not any(colour):
+            file.left_out("light: what a black material emits is read as its colour")
+            colour = light
+        part.colours = np.where(np.isnan(part.colours), colour, part.colours)
+    if any(alpha) or "map_d" in material or (texture is not None and texture.lowest_alpha < 1.0):
+        file.left_out("transparency: all is opaque")
 
 
 # OFF. trimesh reads no colours, and cuts polygons as if they were convex.
@@ -318,7 +442,7 @@ def _read_stl(file: MeshFile, content: bytes) -> list[Part]:
     # trimesh takes what is followed by more bytes for text.
     size = 84 + 50 * int.from_bytes(content[80:84], "little")
     if 84 < size < len(content):
-        file.count_left_out(len(content) - size, "byte after the end", "bytes after the end")
+        file.count_left_out(len(content) - size, "byte(s) after the end")
         content = content[:size]
     with warnings.catch_warnings():
         # Numbers after text that is none would be left out.
@@ -358,7 +482,7 @@ def _stl_colours(words: NDArray[np.uint16], head: bytes) -> FloatArray | None:
 _READERS = {
     ".glb": read_gltf,
     ".gltf": read_gltf,
-    ".obj": read_obj,
+    ".obj": _read_obj,
     ".off": _read_off,
     ".ply": _read_ply_parts,
     ".stl": _read_stl,

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
-from collections.abc import Callable
+from collections import deque
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -22,9 +24,8 @@ MAX_TRIANGLES = 2**23
 """Maximum number of triangles of a mesh."""
 
 _MAX_TEXELS = 2**27
-_MAX_WORK = 2**28
-_MAX_SEARCHES = 4
-_VECTORISED = 40  # corners
+_MAX_WORK = 2**27
+_MAX_TRIES = 8  # for each corner of a polygon
 
 
 class FileTexture(NamedTuple):
@@ -72,14 +73,29 @@ class MeshFile:
         """Return an error about this file."""
         return NPAError(f"target {shown(str(self.path))} {text}")
 
+    @contextlib.contextmanager
+    def reading(self, what: str) -> Iterator[None]:
+        """Within it, an exception becomes an error: this file cannot be read as `what`."""
+        try:
+            with np.errstate(all="ignore"):
+                yield
+        except NPAError:
+            raise
+        except Exception as error:
+            # Damaged files raise exceptions of many kinds.
+            cause = f"{type(error).__name__}: {shown(error)}"
+            raise self.error(
+                f"cannot be read as {what} ({cause}): save it again, for example as .ply"
+            ) from error
+
     def left_out(self, text: str) -> None:
         """Warn of what was left out."""
         left_out(self.path.name, text)
 
-    def count_left_out(self, count: int, one: str, more: str) -> None:
-        """Warn of a number of things that were left out, if there were any."""
+    def count_left_out(self, count: int, things: str) -> None:
+        """Warn of a number of things, such as "corner(s)", that were left out, if any were."""
         if count > 0:
-            self.left_out(f"{count} {one if count == 1 else more}")
+            self.left_out(f"{count} {things.replace('(s)', 's' * (count > 1))}")
 
     def neighbour(self, name: str) -> bytes | None:
         """Return the bytes of a file that this one names, None if it is not there.
@@ -132,8 +148,7 @@ class MeshFile:
         `corners` are the vertex indices of all polygons, `counts` their numbers of corners.
         """
         self.check_corners(vertices, corners)
-        few = "face{} with fewer than three corners"
-        self.count_left_out(int((counts < 3).sum()), few.format(""), few.format("s"))
+        self.count_left_out(int((counts < 3).sum()), "face(s) with fewer than three corners")
         try:
             return triangulated(vertices[corners], counts)
         except NPAError as error:
@@ -203,14 +218,6 @@ def triangulated(points: FloatArray, counts: IntArray) -> tuple[IntArray, IntArr
     return np.concatenate(triangles)[order], np.concatenate(owners)[order]
 
 
-def strip(run: IntArray) -> IntArray:
-    """Return the triangles [F, 3] of a strip: each corner after the second makes one."""
-    rows = np.stack((run[:-2], run[1:-1], run[2:]), axis=1) if len(run) > 2 else run[:0, None]
-    rows = rows.reshape(-1, 3)
-    rows[1::2] = rows[1::2, [1, 0, 2]]
-    return rows
-
-
 def _flattened(points: FloatArray) -> FloatArray:
     """Return a polygon [n, 3] in the plane of two axes, [n, 2], counterclockwise."""
     around = points - points[0]
@@ -234,53 +241,28 @@ def _is_convex(flat: FloatArray) -> bool:
 
 def _ears(flat: FloatArray) -> IntArray:
     """Return the triangles [n - 2, 3] of a polygon [n, 2] that is not convex."""
-    x, y = flat[:, 0].tolist(), flat[:, 1].tolist()
-    count = len(x)
-    before, after = [count - 1, *range(count - 1)], [*range(1, count), 0]
-
-    def area(a: int, b: int, c: int) -> float:
-        return float((x[b] - x[a]) * (y[c] - y[a]) - (y[b] - y[a]) * (x[c] - x[a]))
-
-    def is_ear(b: int) -> bool:
-        a, c = before[b], after[b]
-        if area(a, b, c) <= 0:
-            return False
-        # Corners at the place of the ear's own are where a hole is joined to the outline.
-        if len(reflex) > _VECTORISED:
-            others = flat[list(reflex)]
-            inside = np.ones(len(others), dtype=bool)
-            for p, q in ((a, b), (b, c), (c, a)):
-                away, along = others - flat[p], flat[q] - flat[p]
-                inside &= along[0] * away[:, 1] - along[1] * away[:, 0] >= 0
-                inside &= (away != 0).any(axis=1)
-            return not inside.any()
-        own = {(x[k], y[k]) for k in (a, b, c)}
-        return not any(
-            area(a, b, k) >= 0 and area(b, c, k) >= 0 and area(c, a, k) >= 0
-            for k in reflex
-            if (x[k], y[k]) not in own
-        )
-
-    left = dict.fromkeys(range(count))
-    reflex = {k for k in left if area(before[k], k, after[k]) <= 0}
-    ears = {k for k in left if is_ear(k)}
-    triangles: list[tuple[int, int, int]] = []
-    searches = 0
+    left, triangles = deque(range(len(flat))), []
+    tries, missed = _MAX_TRIES * len(flat), 0
     while len(left) > 2:
-        if not ears and searches < _MAX_SEARCHES:
-            searches += 1
-            # Without an ear, the outline crosses itself or what is left of it is a line.
-            ears = {k for k in left if is_ear(k)} or {
-                min(left, key=lambda k: abs(area(before[k], k, after[k])))
-            }
-        ear = ears.pop() if ears else next(iter(left))
-        a, c = before[ear], after[ear]
-        triangles.append((a, ear, c))
-        after[a], before[c] = c, a
-        del left[ear]
-        reflex.discard(ear)
-        for k in (a, c):
-            if area(before[k], k, after[k]) > 0:
-                reflex.discard(k)
-            (ears.add if is_ear(k) else ears.discard)(k)
+        a, b, c = left[0], left[1], left[2]
+        # Without an ear, the outline crosses itself or what is left of it is a line.
+        if missed > len(left) or tries < 0 or _is_ear(flat[[a, b, c]], flat[left]):
+            triangles.append((a, b, c))
+            del left[1]
+            left.rotate(1)
+            missed = 0
+        else:
+            left.rotate(-1)
+            missed, tries = missed + 1, tries - 1
     return np.array(triangles, dtype=np.int64)
+
+
+def _is_ear(corners: FloatArray, outline: FloatArray) -> bool:
+    """Return whether a triangle [3, 2] turns left, and no corner of the outline [n, 2] is in it."""
+    along = np.roll(corners, -1, axis=0) - corners
+    away = outline[:, None] - corners
+    inside = (along[:, 0] * away[..., 1] - along[:, 1] * away[..., 0] >= 0).all(axis=1)
+    # Corners at the place of the ear's own are where a hole is joined to the outline.
+    inside &= (away != 0).any(axis=2).all(axis=1)
+    (ux, uy), (vx, vy) = along[:2]
+    return bool(ux * vy - uy * vx > 0 and not inside.any())

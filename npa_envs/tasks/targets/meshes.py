@@ -9,6 +9,7 @@ from typing import Any, Literal
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from PIL import Image
 
 from npa_envs.atomic_files import home_path
 from npa_envs.errors import NPAError, shown, suggest
@@ -142,27 +143,12 @@ def srgb_values(brightness: NDArray[Any]) -> NDArray[Any]:
 
 def halved(pixels: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """Return an sRGB picture [H, W, 3] at half its size, averaged in linear light."""
-    channels = []
+    size, channels = (max(pixels.shape[1] // 2, 1), max(pixels.shape[0] // 2, 1)), []
     for k in range(3):
-        channel = _BRIGHTNESS.astype(np.float32)[pixels[..., k]]
-        half = _halved_rows(_halved_rows(channel).T).T
-        channels.append((255.0 * srgb_values(half)).round().clip(0, 255).astype(np.uint8))
+        channel = Image.fromarray(_BRIGHTNESS.astype(np.float32)[pixels[..., k]])
+        half = np.asarray(channel.resize(size, Image.Resampling.BOX))
+        channels.append((255.0 * srgb_values(half)).round().astype(np.uint8))
     return np.stack(channels, axis=-1)
-
-
-def _halved_rows(values: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return half as many rows, rounded down, each the mean over an equal part of the height."""
-    count, half = len(values), len(values) // 2
-    if count == 1:
-        return values
-    upper, lower = values[: 2 * half : 2], values[1 : 2 * half : 2]
-    if count == 2 * half:
-        return 0.5 * (upper + lower)
-    share = np.arange(1, half + 1, dtype=np.float32)[:, None] / np.float32(count)
-    mean: NDArray[np.float32] = upper * (half / count + 1.0 / count - share)
-    mean += lower * (half / count)
-    mean += values[2::2] * share
-    return mean
 
 
 _BRIGHTNESS = linear_light(np.arange(256) / 255.0)
@@ -172,20 +158,20 @@ def _textured_faces(mesh: Mesh, light: FloatArray) -> TexturedFaces | None:
     """Return a mesh's textures with all their levels; `light`: brightness of each corner."""
     if mesh.texture_of_face is None or mesh.uv is None or (mesh.texture_of_face < 0).all():
         return None
-    texels, headers, total = [], [], 0
+    limit = min(MAX_TEXELS, MAX_ALL_TEXELS // len(mesh.textures))
+    texels: list[NDArray[np.uint8]] = []
+    headers: list[list[tuple[int, int, int]]] = []
+    total = 0
     for texture in mesh.textures:
         pixels = texture.pixels
-        while pixels[..., 0].size > min(MAX_TEXELS, MAX_ALL_TEXELS // len(mesh.textures)):
+        while pixels[..., 0].size > limit:
             pixels = halved(pixels)
-        header = []
-        while True:
-            header.append((total, pixels.shape[1], pixels.shape[0]))
+        headers.append([])
+        while not headers[-1] or texels[-1].size > 3:
+            headers[-1].append((total, pixels.shape[1], pixels.shape[0]))
             texels.append(pixels.reshape(-1, 3))
             total += len(texels[-1])
-            if pixels.shape[:2] == (1, 1):
-                break
             pixels = halved(pixels)
-        headers.append(header)
     depth = max(map(len, headers))
     levels = [header + [(0, 0, 0)] * (depth - len(header)) for header in headers]
     wrap = [[WRAP_NUMBERS[side] for side in texture.wrap] for texture in mesh.textures]

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from npa_envs.atomic_files import open_regular, read_bytes
-from npa_envs.errors import NPAError, importing, shown
+from npa_envs.errors import importing, shown
 from npa_envs.ops import Cameras, render_gaussians
 from npa_envs.tasks.gaussian_outputs import HARMONIC_0
 from npa_envs.tasks.targets.mesh_files import PlyProperty, ply_colours, read_ply
@@ -102,22 +102,12 @@ def read_splats(path: Path) -> GaussianCloud:
     The bounding box of the points, or of the middles of visible Gaussians, is centred at 0.
     """
     file = MeshFile(path)
-    try:
-        with np.errstate(all="ignore"):
-            vertex = read_ply(read_bytes(path, limit=MAX_FILE, what="target"))[0]["vertex"]
-            if "packed_position" in vertex:
-                raise file.error("is compressed (packed_position): save it as an ordinary PLY")
-            trained = ply_kind(path) == "gaussians"
-            splats = (_trained_gaussians if trained else _points)(file, vertex)
-    except NPAError:
-        raise
-    except Exception as error:
-        # Damaged files raise exceptions of many kinds.
-        raise file.error(
-            f"cannot be read as points or Gaussians ({type(error).__name__}: {shown(error)}): save "
-            "it again"
-        ) from error
-    return splats
+    with file.reading("points or Gaussians"):
+        vertex = read_ply(read_bytes(path, limit=MAX_FILE, what="target"))[0]["vertex"]
+        if "packed_position" in vertex:
+            raise file.error("is compressed (packed_position): save it as an ordinary PLY")
+        trained = ply_kind(path) == "gaussians"
+        return (_trained_gaussians if trained else _points)(file, vertex)
 
 
 def _columns(file: MeshFile, vertex: Element, names: tuple[str, ...]) -> FloatArray:
@@ -162,7 +152,7 @@ def _points(file: MeshFile, vertex: Element) -> GaussianCloud:
         file.left_out("colours, as the file has none: all is grey")
         colours = np.full(points.shape, file.plain)
     finite = np.isfinite(points).all(axis=1)
-    file.count_left_out(int((~finite).sum()), "point without a place", "points without a place")
+    file.count_left_out(int((~finite).sum()), "point(s) without a place")
     step = -(-len(points) // MAX_POINTS)
     if step > 1:
         file.left_out(f"all points but one of {step}, as there are {len(points)}")
@@ -170,9 +160,7 @@ def _points(file: MeshFile, vertex: Element) -> GaussianCloud:
     unique, first = np.unique(points, axis=0, return_index=True)
     if len(unique) <= NEIGHBOURS:
         raise file.error(f"must hold at least {NEIGHBOURS + 1} points apart, got {len(unique)}")
-    file.count_left_out(
-        len(points) - len(unique), "point at the place of another", "points at places of others"
-    )
+    file.count_left_out(len(points) - len(unique), "point(s) at the place of another")
     points, colours = unique, colours[first]
     distances, nearest = KDTree(points).query(points, k=NEIGHBOURS + 1)
     apart = points[nearest] - points[nearest].mean(axis=1, keepdims=True)
@@ -228,15 +216,10 @@ def draw_splats(splats: GaussianCloud, cameras: Cameras) -> Tensor:
     Gaussians have their own colours, without the light of meshes.
     """
     samples = max(1, min(SAMPLES, MAX_SIDE // max(cameras.width, cameras.height)))
-    fine = replace(
-        cameras,
-        intrinsics=samples * cameras.intrinsics,
-        width=samples * cameras.width,
-        height=samples * cameras.height,
-    )
+    fine = replace(cameras, width=samples * cameras.width, height=samples * cameras.height)
+    lenses = samples * cameras.intrinsics.expand(cameras.count, 4)
     pictures = []
-    for k, motion in enumerate(cameras.world_to_camera):
-        lens = fine.intrinsics if fine.intrinsics.ndim == 1 else fine.intrinsics[k]
+    for motion, lens in zip(cameras.world_to_camera, lenses, strict=True):
         camera = replace(fine, world_to_camera=motion[None], intrinsics=lens)
         eye = -motion[:3, :3].mT @ motion[:3, 3]
         drawn = render_gaussians(

@@ -127,20 +127,17 @@ def load_texture(
     `resolution` pixels along each side. `tiles` says whether the opposite edges of a picture file
     fit together, as those of built-in textures do.
     """
-    if not isinstance(source, str | Path) or not str(source):
-        raise NPAError(
-            f"target must be a built-in texture or the path of a picture, got {shown(source)}: "
-            "for example 'cells'"
-        )
     check_count("resolution", resolution, ": try 128", at_most=MAX_RESOLUTION)
     if isinstance(source, str) and source in PATTERNS:
         return _texture_target(source, draw_pattern(source, resolution), True)
-    path = home_path(source)
-    if isinstance(source, str) and not looks_like_path(str(path)):
+    if not isinstance(source, Path) and not (
+        isinstance(source, str) and source and looks_like_path(str(home_path(source)))
+    ):
         raise NPAError(
             "target must be a built-in texture or the path of a picture file, "
             f"got {shown(source)}: {suggest(source, PATTERNS)}"
         )
+    path = home_path(source)
     image = open_image(path)
     require_opaque_pixels(image, label=str(path))
     side = min(image.size)

@@ -1,23 +1,40 @@
-"""Views of a 3D target: pictures with alpha from known cameras, some of them held out."""
+"""Views of a 3D target: pictures with alpha from known cameras, some of them held out.
+
+They are drawn of meshes, points and Gaussians, or read from folders of pictures and cameras in the
+formats of NeRF-synthetic (Mildenhall et al. 2020) and of instant-ngp and nerfstudio.
+"""
 
 from __future__ import annotations
 
-import functools
+import contextlib
 import math
 import os
-from collections.abc import Callable
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any, NamedTuple
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
+from PIL import Image
 from torch import Tensor
 
-from npa_envs.atomic_files import home_path
-from npa_envs.checks import check_count
-from npa_envs.errors import NPAError, shown
-from npa_envs.ops import Cameras, look_at, orbit
-from npa_envs.tasks.targets.meshes import Mesh, draw_mesh, load_mesh
-from npa_envs.tasks.targets.splat_files import draw_splats, ply_kind, read_splats
+from npa_envs.atomic_files import home_path, read_json
+from npa_envs.checks import check_count, is_real
+from npa_envs.errors import NPAError, shown, suggest
+from npa_envs.ops import Cameras, cameras_of_poses, look_at, orbit
+from npa_envs.tasks.targets.images import (
+    BACKGROUND_TOLERANCE,
+    FloatImage,
+    cut_out,
+    is_cut_out,
+    open_image,
+    scaled_square,
+)
+from npa_envs.tasks.targets.meshes import RADIUS, Mesh, draw_mesh, load_mesh
+from npa_envs.tasks.targets.notes import left_out
+from npa_envs.tasks.targets.splat_files import GaussianCloud, draw_splats, ply_kind, read_splats
 
 DISTANCE = 3.2
 """Distance of cameras from the origin [length units]."""
@@ -95,44 +112,32 @@ def load_views(
         )
     folder = home_path(source)
     if os.path.isdir(folder):
-        # The readers make views.
-        from npa_envs.tasks.targets.view_folders import read_view_folder
-
-        return read_view_folder(folder, resolution, training_count, held_out_count)
+        return _read_view_folder(folder, resolution, training_count, held_out_count)
+    shape: GaussianCloud | Mesh
     if folder.suffix.lower() == ".ply" and folder.is_file() and ply_kind(folder) != "triangles":
-        splats = read_splats(folder)
-        draw = functools.partial(draw_splats, splats)
-        counted = (training_count, held_out_count)
-        return _views_around(draw, folder.stem, resolution, counted, splats.summary)
-    mesh = load_mesh(source)
-    return views_of_mesh(mesh, folder.stem, resolution, training_count, held_out_count)
+        shape = read_splats(folder)
+    else:
+        shape = load_mesh(source)
+    return drawn_views(shape, folder.stem, resolution, training_count, held_out_count)
 
 
-def views_of_mesh(
-    mesh: Mesh, name: str, resolution: int, training_count: int, held_out_count: int
-) -> ViewTarget:
-    """Return views of a mesh, which fits into the ball of radius 0.85, from cameras all around."""
-    counts = (training_count, held_out_count)
-
-    def draw(cameras: Cameras) -> Tensor:
-        return torch.from_numpy(draw_mesh(mesh, cameras))
-
-    return _views_around(draw, name, resolution, counts, mesh.summary)
-
-
-def _views_around(
-    draw: Callable[[Cameras], Tensor],
+def drawn_views(
+    shape: GaussianCloud | Mesh,
     name: str,
     resolution: int,
-    counts: tuple[int, int],
-    summary: str,
+    training_count: int,
+    held_out_count: int,
 ) -> ViewTarget:
-    """Return views that a function draws, to train with and held out, from cameras all around."""
+    """Return views of what fits into the ball of radius 0.85, from cameras all around."""
     views = []
-    for count, turn in zip(counts, (0.0, 0.5), strict=True):
+    for count, turn in ((training_count, 0.0), (held_out_count, 0.5)):
         cameras = surrounding_cameras(count, resolution, turn=turn)
-        views.append(Views(cameras, draw(cameras)))
-    return ViewTarget(name, views[0], views[1], summary)
+        if isinstance(shape, Mesh):
+            pictures = torch.from_numpy(draw_mesh(shape, cameras))
+        else:
+            pictures = draw_splats(shape, cameras)
+        views.append(Views(cameras, pictures))
+    return ViewTarget(name, views[0], views[1], shape.summary)
 
 
 def surrounding_cameras(count: int, resolution: int, *, turn: float = 0.0) -> Cameras:
@@ -179,3 +184,338 @@ def nearest_camera(cameras: Cameras, elevation: float) -> int:
     tilt = math.radians(elevation)
     front = positions.new_tensor((0.0, math.sin(tilt), math.cos(tilt)))
     return int((positions @ front / positions.norm(dim=1)).argmax())
+
+
+# Folders of views.
+
+TRAINING_FILE = "transforms_train.json"
+HELD_OUT_FILES = ("transforms_test.json", "transforms_val.json")
+
+SINGLE_FILE = "transforms.json"
+"""File of instant-ngp and nerfstudio, which has all views."""
+
+HELD_OUT_INTERVAL = 8
+"""Every eighth view of a `SINGLE_FILE` is held out, from the first."""
+
+OPAQUE_ALPHA = 0.5
+"""Alpha above which a pixel belongs to the scene."""
+
+UPRIGHT = ((1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.0, -1.0, 0.0))
+"""Rotation from the format's coordinates, z up, to ours, y up."""
+
+PLAIN = 0.9
+"""Share of the pixels at the edges of opaque pictures that must have the background's colour."""
+
+LENS_MODELS = ("PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "PERSPECTIVE")
+"""Values of `camera_model`: pinholes with OpenCV's distortion by k1, k2, p1 and p2."""
+
+_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp")
+_DISTORTION = ("k1", "k2", "p1", "p2")
+_NUMBERS = ("camera_angle_x", "camera_angle_y", "fl_x", "fl_y", "cx", "cy", "w", "h", *_DISTORTION)
+_UNUSABLE = ("k3", "k4", "k5", "k6", "is_fisheye", "ftheta_p0", "latlong", "equirectangular")
+_LENS = ("camera_model", *_NUMBERS, *_UNUSABLE, "rolling_shutter")
+_NEEDLESS = (
+    "frames", "file_path", "transform_matrix", "rotation", "sharpness", "aabb_scale", "scale",
+    "offset", "n_frames", "colmap_im_id", "applied_transform", "applied_scale", "ply_file_path",
+    "time", "x_fov", "y_fov",
+)  # fmt: skip
+"""Names in the files that say nothing more about pictures and cameras."""
+
+
+class FolderView(NamedTuple):
+    """A picture and its camera, as a file describes them."""
+
+    where: str
+    """The frame's name in errors."""
+    picture: Path
+    """The picture's file."""
+    pose: Tensor
+    """Camera to world, z up, shape [4, 4], float64."""
+    lens: Mapping[str, Any]
+    """The file's values of `_LENS`, those of the frame first."""
+
+
+def _read_view_folder(
+    folder: Path, resolution: int, training_count: int, held_out_count: int
+) -> ViewTarget:
+    """Return the target in a folder of views, as `load_views` describes."""
+    frames, others = _read_splits(folder)
+    frames, others = _thinned(frames, training_count), _thinned(others, held_out_count)
+    background = _plain_background(folder, frames + others)
+    training, measured = (_views_of(each, resolution, background) for each in (frames, others))
+    radius = max(scene_radius(training), scene_radius(measured))
+    if radius == 0.0:
+        raise NPAError(
+            f"views must show something, but no picture of {shown(str(folder))} has a pixel of "
+            f"alpha above {OPAQUE_ALPHA}: give pictures with a transparent background"
+        )
+    for views in (training, measured):
+        views.cameras.world_to_camera[:, :3, 3] *= RADIUS / radius
+    first, how = open_image(frames[0].picture), "alpha"
+    if background is not None:
+        how = f"their plain background, sRGB {background.astype(int).tolist()}"
+    counts = f"{len(frames)} views to train with, {len(others)} held out"
+    summary = f"{folder.name}: {counts}, {first.width} x {first.height}, cut out by {how}"
+    return ViewTarget(folder.name, training, measured, summary)
+
+
+def scene_radius(views: Views) -> float:
+    """Return a lower bound on the scene's radius [length units].
+
+    It is the largest distance from the origin of a camera ray on which something is visible. A
+    point is at least as far from the origin as the rays on which it is visible; with many views,
+    one of these rays nearly touches the farthest point.
+    """
+    cameras, radius = views.cameras, 0.0
+    lenses = cameras.intrinsics.double().expand(cameras.count, 4)
+    for motion, lens, picture in zip(
+        cameras.world_to_camera.double(), lenses, views.pictures, strict=True
+    ):
+        row, column = (picture[..., 3] > OPAQUE_ALPHA).nonzero(as_tuple=True)
+        if len(row) == 0:
+            continue
+        pixel = torch.stack((column, row), dim=-1) + 0.5
+        ray = torch.nn.functional.pad((pixel - lens[2:]) / lens[:2], (0, 1), value=1.0)
+        ray /= ray.norm(dim=1, keepdim=True)
+        # The origin in the camera's frame, and its distance from each ray.
+        away = torch.linalg.cross(ray, motion[:3, 3].expand_as(ray)).norm(dim=1)
+        radius = max(radius, float(away.max()))
+    return radius
+
+
+# What the files say.
+
+
+def _read_splits(folder: Path) -> tuple[list[FolderView], list[FolderView]]:
+    """Return the frames of a folder to train with, and others to measure by."""
+    held_out = next((folder / name for name in HELD_OUT_FILES if (folder / name).is_file()), None)
+    if held_out is not None and (folder / TRAINING_FILE).is_file():
+        return _read_frames(folder / TRAINING_FILE), _read_frames(held_out)
+    if not (folder / SINGLE_FILE).is_file():
+        raise NPAError(
+            f"a folder of views must hold {TRAINING_FILE}, and {' or '.join(HELD_OUT_FILES)}, or "
+            f"{SINGLE_FILE}, {shown(str(folder))} does not: views to measure by must be others "
+            "than those trained with"
+        )
+    frames = _read_frames(folder / SINGLE_FILE)
+    if len(frames) < 2:
+        raise NPAError(
+            f"frames in {shown(str(folder / SINGLE_FILE))} must be at least two, one to train with "
+            "and one to measure by, got 1"
+        )
+    others = [frame for k, frame in enumerate(frames) if k % HELD_OUT_INTERVAL]
+    return others, frames[::HELD_OUT_INTERVAL]
+
+
+def _read_frames(path: Path) -> list[FolderView]:
+    """Return the frames of a `transforms*.json`."""
+    file = shown(str(path))
+    try:
+        content = read_json(path)
+    except NPAError as error:
+        raise NPAError(f"cannot read {file} as JSON: {error}") from error
+    content = content if isinstance(content, dict) else {}
+    frames = content.get("frames")
+    if not isinstance(frames, list) or not frames:
+        raise NPAError(f"frames in {file} must be a list with at least one view")
+    found = [_read_frame(path, k, frame, content) for k, frame in enumerate(frames)]
+    names = {name for values in (content, *frames) for name in values}
+    unused = sorted(str(name) for name in names - {*_LENS, *_NEEDLESS})
+    if unused:
+        left_out(str(path), ", ".join(unused))
+    if len({str(frame.get("time")) for frame in frames}) > 1:
+        raise NPAError(
+            f"the views of {file} must show a thing at rest, got frames with other times"
+        )
+    return found
+
+
+def _read_frame(path: Path, number: int, frame: Any, content: dict[str, Any]) -> FolderView:
+    """Return a frame of a `transforms*.json` with this content."""
+    frame, where = frame if isinstance(frame, dict) else {}, f"frame {number} in {shown(str(path))}"
+    name, matrix = frame.get("file_path"), frame.get("transform_matrix")
+    if not isinstance(name, str) or not name:
+        raise NPAError(f"{where} must have a file_path, got {shown(name)}")
+    pose = torch.empty(0)
+    with contextlib.suppress(TypeError, ValueError, RuntimeError, OverflowError):
+        pose = torch.tensor(matrix, dtype=torch.float64)
+    if pose.shape != (4, 4):
+        raise NPAError(f"transform_matrix of {where} must be 4 x 4 numbers, got {shown(matrix)}")
+    inside = os.path.normpath(name)
+    if os.path.isabs(name) or inside == os.curdir or inside.split(os.sep)[0] == os.pardir:
+        raise NPAError(
+            f"file_path of {where} must name a file in that folder, got {shown(name)}: put the "
+            "pictures next to it"
+        )
+    file = path.parent / inside
+    if file.suffix.lower() not in _SUFFIXES and not file.is_file():
+        # NeRF-synthetic's file_path has no suffix.
+        files = [file.with_name(file.name + suffix) for suffix in _SUFFIXES]
+        file = next((each for each in files if each.is_file()), files[0])
+    values = {key: frame.get(key, content.get(key)) for key in _LENS}
+    given = {key: value for key, value in values.items() if value is not None}
+    return FolderView(where, file, pose, given)
+
+
+def _lens_of(
+    frame: FolderView, size: tuple[int, int]
+) -> tuple[NDArray[np.float64], tuple[float, ...]]:
+    """Return the lens in front of a picture of this width and height [pixels].
+
+    It is a pinhole's fx, fy, cx and cy [pixels], shape [4], and k1, k2, p1 and p2 of its distortion
+    (dimensionless).
+    """
+    given, where = frame.lens, frame.where
+    model = str(given.get("camera_model", "PINHOLE")).upper()
+    if model not in LENS_MODELS:
+        raise NPAError(
+            f"camera_model of {where} must be a pinhole with distortion k1, k2, p1, p2, got "
+            f"{shown(model)}: undistort the pictures; {suggest(model, LENS_MODELS)}"
+        )
+    unusable = [name for name in (*_UNUSABLE, "rolling_shutter") if np.any(given.get(name))]
+    if unusable:
+        raise NPAError(
+            f"{unusable[0]} of {where} must be 0, got {shown(given[unusable[0]])}: undistort the "
+            "pictures, only k1, k2, p1 and p2 are used"
+        )
+    for name in _NUMBERS:
+        if not is_real(given.get(name, 0)):
+            raise NPAError(f"{name} of {where} must be a number, got {shown(given[name])}")
+    width, height = given.get("w", size[0]), given.get("h", size[1])
+    if min(width, height) <= 0 or abs(width / height * size[1] / size[0] - 1.0) > 0.01:
+        raise NPAError(
+            f"w and h of {where} must be those of its picture, {size[0]} and {size[1]}, or in that "
+            f"ratio, got {shown(width)} and {shown(height)}"
+        )
+    lengths = []
+    for axis, side in (("x", width), ("y", height)):
+        focal, angle = given.get(f"fl_{axis}"), given.get(f"camera_angle_{axis}")
+        if focal is not None and not focal > 0.0:
+            raise NPAError(f"fl_{axis} of {where} must be positive [pixels], got {shown(focal)}")
+        if angle is not None and not 0.0 < angle < math.pi:
+            raise NPAError(
+                f"camera_angle_{axis} of {where} must be an angle between 0 and pi radians, "
+                f"got {shown(angle)}"
+            )
+        if focal is None and angle is not None:
+            focal = 0.5 * side / math.tan(0.5 * angle)
+        lengths.append(focal)
+    across, down = lengths
+    if across is None and down is None:
+        raise NPAError(
+            f"camera_angle_x of {where} must be an angle between 0 and pi radians, got None; fl_x "
+            "is not there either"
+        )
+    middle = given.get("cx", 0.5 * width), given.get("cy", 0.5 * height)
+    pinhole = np.array((across or down, down or across, *middle), dtype=np.float64)
+    distortion = tuple(float(given.get(name, 0.0)) for name in _DISTORTION)
+    return pinhole * np.tile(np.divide(size, (width, height)), 2), distortion
+
+
+# Pictures.
+
+
+def _thinned(frames: Sequence[FolderView], count: int) -> list[FolderView]:
+    """Return at most `count` evenly spaced frames."""
+    count = min(count, len(frames))
+    return [frames[k * len(frames) // count] for k in range(count)]
+
+
+def _plain_background(folder: Path, frames: Sequence[FolderView]) -> FloatImage | None:
+    """Return the colour behind the thing in opaque pictures, [3]; None: they have transparency."""
+    edges = []
+    for frame in frames:
+        image = open_image(frame.picture)
+        if is_cut_out(image):
+            return None
+        rgb = np.asarray(image.convert("RGB"))
+        edges.append(np.concatenate([rgb[0], rgb[-1], rgb[:, 0], rgb[:, -1]]))
+    border = np.concatenate(edges).astype(np.float32)
+    background: FloatImage = np.median(border, axis=0).round()
+    share = (np.abs(border - background).max(axis=1) <= BACKGROUND_TOLERANCE).mean()
+    if share < PLAIN:
+        raise NPAError(
+            f"views must have a transparent background, or a plain one to cut out, but no picture "
+            f"of {shown(str(folder))} has transparency, and only {share:.0%} of the pixels at "
+            "their edges have one colour: remove the background, and save PNG files"
+        )
+    return background
+
+
+def _views_of(
+    frames: Sequence[FolderView], resolution: int, background: FloatImage | None
+) -> Views:
+    """Return the views of frames, rotated so that y is up."""
+    pictures, lenses = [], []
+    for frame in frames:
+        picture, lens = _square_view(frame, resolution, background)
+        pictures.append(torch.from_numpy(picture))
+        lenses.append(lens)
+    poses = torch.stack([frame.pose for frame in frames])
+    poses[:, :3] = torch.tensor(UPRIGHT, dtype=poses.dtype) @ poses[:, :3]
+    intrinsics = torch.from_numpy(np.stack(lenses)).float()
+    try:
+        # Only the poses of these cameras are used.
+        cameras = cameras_of_poses(poses.float(), 1.0, width=resolution, height=resolution)
+    except NPAError as error:
+        raise NPAError(f"{frames[0].where} or another one: {error}") from error
+    same = bool((intrinsics == intrinsics[0]).all())
+    cameras = replace(cameras, intrinsics=intrinsics[0] if same else intrinsics)
+    return Views(cameras, torch.stack(pictures))
+
+
+def _square_view(
+    frame: FolderView, resolution: int, background: FloatImage | None
+) -> tuple[FloatImage, NDArray[np.float64]]:
+    """Return the picture of a frame, [R, R, 4], without distortion, and its fx, fy, cx and cy."""
+    image = open_image(frame.picture)
+    size, (pinhole, distortion) = image.size, _lens_of(frame, image.size)
+    if background is not None or any(distortion):
+        # No larger than needed, as what follows takes time.
+        factor = max(min(size) // (4 * resolution), 1)
+        image = image.convert("RGBa").reduce(factor).convert("RGBA")
+        pinhole = pinhole * np.tile(np.divide(image.size, size), 2)
+    if background is not None:
+        image = cut_out(image, background)
+    if any(distortion):
+        image = _undistorted(image, pinhole, distortion)
+    width, height = image.size
+    alpha = np.asarray(image.getchannel("A"))
+    sides = (alpha[:, [0, -1]] if height > width else alpha[[0, -1]]).max()
+    # Where the thing lies within the picture it is shown whole, else a square of the picture.
+    side = max(width, height) if sides < 255 * OPAQUE_ALPHA else min(width, height)
+    left, top = (width - side) // 2, (height - side) // 2
+    square = image.crop((left, top, left + side, top + side))
+    return scaled_square(square, resolution), (pinhole - (0, 0, left, top)) * resolution / side
+
+
+@np.errstate(all="ignore")
+def _undistorted(
+    image: Image.Image, pinhole: NDArray[np.float64], distortion: tuple[float, ...]
+) -> Image.Image:
+    """Return a picture as a pinhole with the same numbers shows it, transparent beyond its edges.
+
+    A ray (x, y, 1) is seen at x (1 + k1 r² + k2 r⁴) + 2 p1 x y + p2 (r² + 2 x²), and alike in y, of
+    the distorted picture.
+    """
+    (fx, fy, cx, cy), (k1, k2, p1, p2) = pinhole, distortion
+    width, height = image.size
+    x = ((np.arange(width) + 0.5 - cx) / fx)[None]
+    y = ((np.arange(height) + 0.5 - cy) / fy)[:, None]
+    squares = x * x + y * y
+    radial = 1.0 + k1 * squares + k2 * squares * squares
+    column = fx * (x * radial + 2.0 * p1 * x * y + p2 * (squares + 2.0 * x * x)) + cx
+    row = fy * (y * radial + p1 * (squares + 2.0 * y * y) + 2.0 * p2 * x * y) + cy
+    # Beyond the first radius where the distortion turns back, nothing was seen.
+    roots = np.roots((5.0 * k2, 3.0 * k1, 1.0))
+    turns = [float(t.real) for t in roots if abs(t.imag) < 1e-9 and t.real > 0.0]
+    column[squares > min(turns, default=math.inf)] = -2.0 * width
+    grid = np.stack((2.0 * column / width - 1.0, 2.0 * row / height - 1.0), axis=-1)
+    source = np.asarray(image.convert("RGBa")).astype(np.float32)
+    sampled = torch.nn.functional.grid_sample(
+        torch.from_numpy(source).movedim(-1, 0)[None],
+        torch.from_numpy(grid)[None].float(),
+        align_corners=False,
+    )
+    pixels = sampled[0].movedim(0, -1).round().clamp(0.0, 255.0).to(torch.uint8).numpy()
+    return Image.fromarray(pixels, "RGBa").convert("RGBA")
