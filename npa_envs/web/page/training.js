@@ -20,6 +20,7 @@ export class TrainingCard {
     this.open = false;
     this.choosing = false; // whether to choose another one, where one is learned already
     this.refusal = ""; // why the server did not take the last upload
+    this.refusedBusy = false; // whether something was being learned then
   }
 
   listen(event) {
@@ -75,6 +76,7 @@ export class TrainingCard {
       this.psnr = null;
     } catch (error) {
       this.refusal = error.message;
+      this.refusedBusy = ACTIVE.includes(this.event.state);
     }
     this.render();
   }
@@ -117,7 +119,12 @@ export class TrainingCard {
 
   // What went wrong last, for the user.
   get problem() {
-    return this.refusal || (this.event.state === "failed" ? this.event.message : "");
+    const { refusal, event: { name, state, cure, message } } = this;
+    // Not a refusal because of a training that has ended since.
+    if (refusal && this.refusedBusy === ACTIVE.includes(state)) return refusal;
+    if (cure === "whole") return `${name} is opaque and its border has many colours, so there is no part to cut out: ` +
+      "give a picture with a transparent background, or grow all of it";
+    return state === "failed" ? message : "";
   }
 
   closed() {
@@ -139,7 +146,7 @@ export class TrainingCard {
   chooser() {
     const emoji = make("input", { type: "text", placeholder: "\u{1F98A}", maxLength: 16, size: 4 });
     emoji.setAttribute("aria-label", "An emoji");
-    const typed = () => { if (emoji.value.trim()) this.take(emoji.value.trim()); };
+    const typed = () => this.take(emoji.value.trim() || emoji.placeholder);
     emoji.onkeydown = ({ key }) => { if (key === "Enter") typed(); };
     return [
       heading("Grow your own picture", () => this.fold()),
