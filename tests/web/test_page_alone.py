@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
 import subprocess
@@ -59,6 +60,7 @@ def test_each_frame_is_answered_once_it_or_a_later_one_is_drawn(run):
 def test_each_brush_sends_its_messages_at_its_time(run):
     strokes = run("""
         const strokes = {};
+        element("radius").value = 1;
         for (const { name } of tools) {
           page.brushes.choose(name);
           sent.length = 0;
@@ -78,15 +80,32 @@ def test_each_brush_sends_its_messages_at_its_time(run):
     # In tens of pixels from the middle: position, movement, and where the stroke began.
     assert strokes == {
         **{
-            name: [[-1, 0, None], [-1, 0, None], [-1, 2, None], [1, 0, None]]
+            name: [[-1, 0, None], [-1, 0, None], [1, 2, None], [1, 0, None]]
             for name in ("wipe", "clump", "noise", "remove")
         },
-        "inject": [[-1, 0, -1], [-1, 0, -1], [-1, 2, -1], [1, 0, -1]],
+        "inject": [[-1, 0, -1], [-1, 0, -1], [1, 2, -1], [1, 0, -1]],
         "push": [[-1, 0, None], [-1, 2, None]],
-        "graft": [[-1, 0, None], [1, 0, None]],
+        "graft": [[-1, 0, None], [1, 2, None]],
         "add": [[-1, 0, None]],
         "cut": [[-1, 2, None]],
     }
+
+
+@pytest.mark.parametrize("name", ["wipe", "graft"])
+def test_a_quick_stroke_leaves_no_gaps_and_ends_where_the_pointer_is_released(run, name):
+    places = run(f"""
+        page.brushes.choose("{name}");
+        element("radius").value = 0.1;
+        const event = (type, clientX) =>
+          ({{ type, clientX, clientY: 40, pointerId: 1, button: 0, pointerType: "mouse" }});
+        page.brushes.press(event("pointerdown", 20));
+        page.brushes.move(event("pointermove", 60));
+        page.brushes.release(event("pointerup", 60));
+        return ofType("brush").map(({{ at }}) => at[0]);
+    """)
+    assert places[-1] - places[0] == pytest.approx(40 * 0.0275)
+    steps = [after - before for before, after in itertools.pairwise(places)]
+    assert 0.05 < min(steps) <= max(steps) < 0.1001
 
 
 def test_a_page_begins_with_a_brush_that_heals_and_says_what_it_does(run):

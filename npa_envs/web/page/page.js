@@ -17,6 +17,8 @@ const LOOK = { name: "look", label: "Look: drag to move or turn, wheel or pinch 
 // What colours mean, by the names of `shows_of` of live_world.py, those of state channels without their number.
 const MEANINGS = {
   colours: "The particles' own colours: the picture, or the class that each names.",
+  digits: "Which digit each particle takes this for: 0 red, 1 green, 2 yellow, 3 blue, 4 orange, 5 purple, 6 cyan, " +
+    "7 pink, 8 brown, 9 black; grey where it is not sure.",
   density: "How crowded it is around a particle, from dark to bright.",
   components: "The three directions in which states differ most, as red, green and blue: like colour, like state.",
   species: "Which rule a particle follows.",
@@ -247,9 +249,16 @@ class Brushes {
     this.chosen = this.offered.find((brush) => brush.name === name) ?? LOOK;
     for (const button of $("brushes").children)
       button.setAttribute("aria-checked", String(button.dataset.brush === this.chosen.name));
-    $("hint").textContent = this.chosen.label;
+    if (this.chosen.takes === "rule") $("brush").open = true;
+    this.showHint();
     if (this.chosen === LOOK) $("cursor").hidden = true;
     this.canvas.style.cursor = this.chosen === LOOK ? "grab" : "crosshair";
+  }
+
+  // Says what the brush does, and which rule it takes.
+  showHint() {
+    const { label, takes } = this.chosen, other = takes === "rule" && $("other").value;
+    $("hint").textContent = other ? `${label} (${other})` : label;
   }
 
   // The position of the pointer on the canvas [pixels].
@@ -298,6 +307,8 @@ class Brushes {
   release(event) {
     const { stroke } = this;
     this.pointers.delete(event.pointerId);
+    // The end of a movement that no frame of the screen has seen.
+    if (stroke && stroke.at !== stroke.sent && event.type === "pointerup") this.act();
     if (stroke && this.chosen.sends === "line" && event.type === "pointerup") {
       const move = [stroke.at[0] - stroke.from[0], stroke.at[1] - stroke.from[1]];
       if (Math.hypot(...move) > 4) this.use(stroke.from, move);
@@ -364,12 +375,17 @@ class Brushes {
 
   // Sends what the brush does in a frame of the screen.
   act() {
-    const { stroke, chosen: { sends } } = this;
+    const { stroke, canvas, chosen: { sends } } = this;
     if (!stroke) return;
-    const move = [stroke.at[0] - stroke.sent[0], stroke.at[1] - stroke.sent[1]], moved = Math.hypot(...move) > 0;
-    if (sends === "frame" || (sends === "motion" && moved)) this.use(stroke.sent, move);
-    if (sends === "position" && moved) this.use(stroke.at, [0, 0]);
-    stroke.sent = stroke.at;
+    const { at, sent } = stroke, move = [at[0] - sent[0], at[1] - sent[1]], moved = Math.hypot(...move);
+    if (sends === "motion" && moved) this.use(sent, move);
+    if (sends === "frame" || (sends === "position" && moved)) {
+      // A quick movement in parts, at most a radius long: it leaves no gaps.
+      const length = moved * this.page.camera.unit(canvas.clientWidth, canvas.clientHeight);
+      const parts = Math.max(1, Math.ceil(length / this.radius())), part = move.map((pixels) => pixels / parts);
+      for (let k = 1; k <= parts; k++) this.use([sent[0] + k * part[0], sent[1] + k * part[1]], part);
+    }
+    stroke.sent = at;
   }
 }
 
@@ -385,6 +401,7 @@ class Controls {
     $("reset").onclick = () => page.send({ type: "reset" });
     $("fold").onclick = () => this.fold(!$("panel").hidden);
     $("rule").onchange = () => page.send({ type: "set", name: "rule", value: $("rule").value });
+    $("other").onchange = () => page.brushes.showHint();
     $("show").onchange = () => page.send({ type: "set", name: "show", value: $("show").value });
     $("message").onclick = () => ($("message").hidden = true);
     $("snapshot").onclick = () => page.film.snapshot();
@@ -415,11 +432,13 @@ class Controls {
       ? $("other").value : world.others.find((name) => name !== world.rule);
     options($("other"), world.others, other);
     options($("show"), world.shows, world.show);
-    $("meaning").textContent = MEANINGS[world.show.split(" ")[0]];
+    const classes = world.show === "colours" && world.rule === "digits";
+    $("meaning").textContent = MEANINGS[classes ? "digits" : world.show.split(" ")[0]];
     $("rule-field").hidden = world.rules.length < 2;
     $("other-field").hidden = !world.tools.some(({ takes }) => takes === "rule");
     $("brush").hidden = !world.tools.length;
     this.showBrushes();
+    this.page.brushes.showHint();
     $("damage").hidden = !world.damages.length;
     $("damages").replaceChildren(...world.damages.map((name) => make("button", {
       textContent: name, title: `Damage: ${name}`, onclick: () => this.page.send({ type: "damage", name }),
@@ -532,6 +551,7 @@ class Film {
     this.showRecording(on);
     $("writing").hidden = on;
     if (!on) {
+      $("writing").scrollIntoView({ block: "nearest" });
       this.recording.stop();
       this.recording = null;
     } else if (this.page.world.capabilities.includes("film")) {

@@ -19,6 +19,7 @@ export class TrainingCard {
     this.open = false;
     this.choosing = false; // whether to choose another one, where one is learned already
     this.refusal = ""; // why the server did not take the last upload
+    this.busy = false; // whether it did not because something was being learned
   }
 
   listen(event) {
@@ -59,13 +60,14 @@ export class TrainingCard {
   // Uploads a file, or an emoji as text. `options` are keywords of the server's `upload`.
   async take(content, options = {}) {
     const name = content.name ?? content;
-    Object.assign(this, { upload: content, open: true, choosing: false, refusal: "" });
+    Object.assign(this, { upload: content, open: true, choosing: false, refusal: "", busy: false });
     if (typeof content === "string") options.emoji = "1";
     try {
       const mib = (size) => Math.ceil(size / 2 ** 20), { limit } = this.event;
       if (content.size > limit)
         throw Error(`${name} has ${mib(content.size)} MiB, at most ${mib(limit)} are taken: give a smaller file`);
       const answer = await fetch(addressOf("training", { name, ...options }), { method: "POST", body: content });
+      this.busy = answer.status === 409;
       if (!answer.ok) throw Error(await answer.text());
       sessionStorage.setItem(MINE, (await answer.json()).id);
       this.psnr = null;
@@ -110,7 +112,12 @@ export class TrainingCard {
 
   // What went wrong last, for the user.
   get problem() {
-    return this.refusal || (this.event.state === "failed" ? this.event.message : "");
+    const { refusal, event: { name, state, cure, message } } = this;
+    // What was being learned may have ended since.
+    if (refusal && (!this.busy || ACTIVE.includes(state))) return refusal;
+    if (cure === "whole") return `${name} is opaque and its border has many colours, so there is no part to cut out: ` +
+      "give a picture with a transparent background, or grow all of it";
+    return state === "failed" ? message : "";
   }
 
   closed() {
@@ -123,7 +130,7 @@ export class TrainingCard {
   empty() {
     const emoji = make("input", { type: "text", placeholder: "\u{1F98A}", maxLength: 16, size: 4 });
     emoji.setAttribute("aria-label", "An emoji");
-    const typed = () => { if (emoji.value.trim()) this.take(emoji.value.trim()); };
+    const typed = () => this.take(emoji.value.trim() || emoji.placeholder);
     emoji.onkeydown = ({ key }) => { if (key === "Enter") typed(); };
     return [
       this.heading("Grow your own picture"),
