@@ -104,7 +104,7 @@ def _packages() -> Iterator[DoctorLine]:
             fix = f"pip install -U '{name}>={oldest}'" if fault else None
             yield DoctorLine(name, fault or version, fix)
     for extra, faults in extras.items():
-        fix = f"pip install 'npa-envs[{extra}]'" if faults else None
+        fix = f"pip install 'npa-envs[{extra}]', in a clone '.[{extra}]'" if faults else None
         yield DoctorLine(f"[{extra}]", ", ".join(faults) or "installed", fix, True)
 
 

@@ -178,9 +178,15 @@ def shortfalls(tables: Mapping[str, Sequence[Any]]) -> list[str]:
     """Return what does not hold of a rule with these tables, one clause for each failure."""
     clauses = []
     rows = tables.get("growth", ())
-    least = min(filter(math.isfinite, (row.loss for row in rows)), default=math.nan)
+    finite = [row for row in rows if math.isfinite(row.loss)]
+    best = min(finite, key=lambda row: row.loss, default=None)
+    if best is not None and rows[-1].extent > 2.0 * best.extent:
+        clauses.append(
+            f"particles escape: the world is {best.extent:.1f} wide at step {best.step} and "
+            f"{rows[-1].extent:.1f} at step {rows[-1].step}"
+        )
     # Written so that a last loss of NaN also counts as unstable.
-    if rows and not rows[-1].loss <= 4.0 * least:
+    if rows and (best is None or not rows[-1].loss <= 4.0 * best.loss):
         clauses.append(f"unstable: at step {rows[-1].step} the loss is many times the least")
     elif rows and rows[-1].psnr is not None and not rows[-1].psnr >= LIKENESS:
         clauses.append(f"unlike the target: {rows[-1].psnr:.1f} dB at step {rows[-1].step}")

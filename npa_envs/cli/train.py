@@ -16,6 +16,7 @@ import torch.distributed as dist
 import tyro
 
 from npa_envs.cli import INTERRUPTED, common
+from npa_envs.cli.final_report import write_report
 from npa_envs.errors import NPAError, shown
 from npa_envs.tasks.co_morphogenesis2d import CoMorphogenesis2DConfig
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2DConfig
@@ -363,8 +364,6 @@ def finish(
         print(f"  rule        {rule}")
     print(f"  log         {folder.log}\n  pictures    {folder.pictures}/")
     if options.report and result.iteration > 0 and not result.interrupted:
-        from npa_envs.cli.final_report import write_report
-
         seconds = result.record.get("seconds", 0.0)
         command = shlex.join(["npa-envs", "train", *arguments])
         training = f"{result.iteration} iterations in {seconds:.0f} s.\n\n```sh\n{command}\n```"
@@ -439,6 +438,8 @@ def announcement(
         time = f"about {common.duration(expected)} on an idle CPU"
     if options.max_seconds < math.inf:
         time += f", at most {common.duration(options.max_seconds)}"
+    if options.report:
+        time += "; then the report"
     where = config.device if process_count == 1 else f"{process_count} processes ({config.device})"
     return (
         f"{task_name}: learns {' and '.join(goals)} ({'continues' if options.resume else source})",

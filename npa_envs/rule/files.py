@@ -270,6 +270,11 @@ def _locate(source: str | Path) -> tuple[Path, str | None]:
             f"a rule's file must end in {suffixes}, got {shown(text)}: rename it, or train a rule "
             "of a picture by npa-envs train morphogenesis2d --target PICTURE"
         )
+    if os.path.dirname(text):
+        raise NPAError(f"cannot load a rule from {shown(text)}: it does not exist: check the path")
+    run = os.path.join("runs", text)
+    if os.path.isfile(os.path.join(run, "rule.safetensors")):
+        raise NPAError(f"unknown rule {shown(text)}: did you mean the run {shown(run)}?")
     raise NPAError(
         f"unknown rule {shown(text)}: {suggest(text, known)}; or give the path of a "
         f"file that ends in {suffixes}, or a run's folder"

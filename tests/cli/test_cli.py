@@ -194,7 +194,7 @@ def test_doctor_finds_packages_that_are_missing_or_old(monkeypatch):
     assert {name: row.mark for name, row in found.items() if name != "[envs]"} == marks
     assert found["torch"].text.endswith("is older than 999")
     assert found["nosuchpackage"].fix == "pip install -U 'nosuchpackage>=1.0'"
-    assert found["[view]"].fix == "pip install 'npa-envs[view]'"
+    assert found["[view]"].fix == "pip install 'npa-envs[view]', in a clone '.[view]'"
 
 
 @pytest.mark.parametrize(

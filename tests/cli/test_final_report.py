@@ -137,6 +137,9 @@ def test_a_card_says_in_words_what_does_not_hold():
     assert report.shortfalls({"growth": growth}) == []
     rough = [replace(growth[0], step=16, psnr=15.0)]
     assert report.shortfalls({"growth": rough}) == ["unlike the target: 15.0 dB at step 16"]
+    wide = [*growth, replace(growth[0], step=16, extent=2.5)]
+    escape = "particles escape: the world is 1.0 wide at step 8 and 2.5 at step 16"
+    assert report.shortfalls({"growth": wide}) == [escape]
     wound = WoundRow("wipe, radius 0.2", 6, 5, 3, 0.1, 1.0, 0.3, scars="top left, bottom")
     whole = HealingRow("cut, gap 0.1", 0.1, 0.5, None, 6, 8, 0.2)
     assert report.shortfalls({"growth": growth, "healing": [wound, whole]}) == [

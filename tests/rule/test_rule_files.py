@@ -520,7 +520,7 @@ def test_truncated_files_are_refused(tmp_path, name):
         refused("cannot load a rule from", load_rule, f"{tmp_path / name}")
 
 
-def test_missing_files_and_folders_are_named(tmp_path):
+def test_missing_files_and_folders_are_named(tmp_path, monkeypatch):
     (tmp_path / "rule.bin").touch()
     refused(r"must end in \.safetensors, \.pth, \.pt, \.json", load_rule, tmp_path / "rule.bin")
     for suffix in ("safetensors", "pth", "json"):
@@ -528,6 +528,11 @@ def test_missing_files_and_folders_are_named(tmp_path):
         refused(f"rule.{suffix}.*does not exist: check", load_rule, path)
         path.mkdir()
         refused(f"rule.{suffix}", load_rule, path)
+    monkeypatch.chdir(tmp_path)
+    refused("'runs/fish': it does not exist: check the path", load_rule, "runs/fish")
+    (tmp_path / "runs/fish").mkdir(parents=True)
+    (tmp_path / "runs/fish/rule.safetensors").touch()
+    refused("unknown rule 'fish': did you mean the run 'runs/fish'", load_rule, "fish")
 
 
 @pytest.mark.parametrize(
