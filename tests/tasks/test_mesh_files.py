@@ -9,7 +9,7 @@ import struct
 
 import numpy as np
 import pytest
-from PIL import Image
+from PIL import Image, ImageCms
 
 from npa_envs.errors import NPAError
 from npa_envs.tasks.targets.mesh_parts import triangulated
@@ -273,6 +273,52 @@ def test_skipped_transparency_and_light_are_told(tmp_path, caplog):
         "light: what a black material emits is read as its colour",
         "transparency: all is opaque",
     ]
+
+
+def test_alpha_of_colours_of_vertices_is_told_and_hides_what_has_none(tmp_path, caplog):
+    gltf = Gltf()
+    for k, alpha in enumerate((0, 255, 100)):
+        colours = gltf.values(np.tile((255, 0, 0, alpha), (8, 1)).astype(np.uint8), normalized=True)
+        material = {"alphaMode": "BLEND", "name": f"m{k}"}
+        gltf.part({"translation": [2 * k, 0, 0]}, material=material, COLOR_0=colours)
+    mesh = gltf.read(tmp_path)
+    assert (len(mesh.faces), shades(mesh)) == (24, {(255, 0, 0)})
+    (tmp_path / "mesh.off").write_bytes(off("COFF\n8 6 0", (*ORANGE, 100)))
+    cube(load_mesh(tmp_path / "mesh.off"), ORANGE)
+    assert [text.partition(": left out: ")[2] for text in caplog.messages] == [
+        "the invisible triangles of material 'm0'",
+        *["transparency: all is opaque"] * 2,
+    ]
+
+
+def test_bytes_after_the_end_of_a_glb_file_are_not_read(tmp_path):
+    path = Gltf().part(material=base([1, 0, 0, 1])).save(tmp_path / "mesh.glb")
+    path.write_bytes(path.read_bytes() + b"later")
+    cube(load_mesh(path), (255, 0, 0))
+
+
+def test_colours_of_corners_replace_those_of_materials_with_a_word(tmp_path, caplog):
+    (tmp_path / "m.mtl").write_text("newmtl m\nKd 0 1 0\n", encoding="utf-8")
+    text = "mtllib m.mtl\nusemtl m\n" + obj_rows(UNIT) + OBJ_SIDES
+    (tmp_path / "mesh.obj").write_text(text, encoding="utf-8")
+    cube(load_mesh(tmp_path / "mesh.obj"), ORANGE)
+    line = "mesh.obj: left out: colours of materials where corners have some"
+    assert caplog.messages == [line]
+
+
+def test_profiles_of_textures_are_ignored_in_gltf_alone(tmp_path):
+    """As glTF 2.0 says; other formats say nothing of them."""
+    swapped = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
+    swapped = swapped.replace(b"rXYZ", b"tXYZ").replace(b"bXYZ", b"rXYZ").replace(b"tXYZ", b"bXYZ")
+    Image.new("RGB", (2, 2), (255, 0, 0)).save(tmp_path / "t.png", icc_profile=swapped)
+    gltf = Gltf()
+    texture = gltf.add("textures", source=gltf.add("images", uri="t.png"))
+    gltf.part(material=base(index=texture), TEXCOORD_0=gltf.values(UV))
+    assert gltf.read(tmp_path).textures[0].pixels[0, 0].tolist() == [255, 0, 0]
+    head = "comment TextureFile t.png\n"
+    rows = [[*corner, 0.5, 0.5] for corner in CORNERS]
+    (tmp_path / "t.ply").write_bytes(ply(rows, QUADS, "float s, float t", comment=head))
+    assert load_mesh(tmp_path / "t.ply").textures[0].pixels[0, 0, 2] > 200
 
 
 def test_text_files_find_their_data_and_say_what_is_not_there(tmp_path, caplog):

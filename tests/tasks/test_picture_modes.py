@@ -142,6 +142,32 @@ def test_a_nearly_black_picture_stays_so_and_a_line_says_it(tmp_path, caplog):
     told = [message.partition("dark: its largest value is ")[2] for message in caplog.messages]
     tops = ("200 of 65535", "200 of 4294967295", "255 of 65535")
     assert told == [f"{top}: scale its values" for top in tops]
+    # Grey whose 0 is white, and colours, of which Pillow keeps the upper 8 bits.
+    caplog.clear()
+    write_tiff(tmp_path / "i.tif", np.where(DISK, 65335, 65495).astype("<u2"), photometric=0)
+    dark = np.where(DISK[..., None], (200, 0, 3000), 40)
+    write_png(tmp_path / "c.png", dark, 16, 2)
+    write_tiff(tmp_path / "c.tif", dark.astype("<u2"), photometric=2)
+    shades = [pixels(tmp_path / name)[INSIDE].tolist() for name in ("i.tif", "c.png", "c.tif")]
+    assert shades == [[0, 0, 0, 255], [0, 0, 11, 255], [0, 0, 11, 255]]
+    told = [message.partition("dark: its largest value is ")[2] for message in caplog.messages]
+    assert told == [f"{top}: scale its values" for top in ("200 of 65535", *["11 of 255"] * 2)]
+
+
+@pytest.mark.parametrize(
+    ("kind", "content", "told"),
+    [
+        (b"cHRM", struct.pack(">8I", 31270, 32900, 64000, 33000, 21000, 71000, 15000, 6000), 1),
+        (b"cHRM", struct.pack(">8I", 31270, 32900, 64000, 33000, 30000, 60000, 15000, 6000), 0),
+        (b"cICP", bytes((9, 16, 0, 1)), 1),
+        (b"cICP", bytes((1, 13, 0, 1)), 0),
+    ],
+)
+def test_other_primaries_of_a_png_are_told(tmp_path, caplog, kind, content, told):
+    write_png(tmp_path / "c.png", np.full((4, 4, 3), (200, 60, 60)), 8, 2, (kind, content))
+    assert pixels(tmp_path / "c.png")[1, 1].tolist() == [200, 60, 60, 255]
+    line = "left out: its primaries (cHRM or cICP); colours are read as sRGB"
+    assert [message.partition(": ")[2] for message in caplog.messages] == told * [line]
 
 
 @pytest.mark.parametrize(

@@ -168,6 +168,10 @@ def test_the_header_decides_what_a_ply_file_is(tmp_path):
     cases = [(columns_of(), 1, "triangles"), (columns_of(), 0, "points"), (trained, 0, "gaussians")]
     for columns, faces, kind in cases:
         assert ply_kind(write_ply(tmp_path / "file.ply", columns, faces=faces)) == kind
+    path = write_ply(tmp_path / "file.ply", columns_of(), faces=0)
+    comment = b"comment element tristrips 9 \nelement"
+    path.write_bytes(path.read_bytes().replace(b"element", comment, 1))
+    assert ply_kind(path) == "points"
     (tmp_path / "file.ply").write_bytes(b"ply\nelement vertex 3\n")
     assert ply_kind(tmp_path / "file.ply") == "triangles"
 

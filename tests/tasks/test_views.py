@@ -250,6 +250,30 @@ def test_what_a_file_of_views_says_beside_them_is_told(tmp_path, caplog):
     assert caplog.messages == [f"{folder / TRAIN}: left out: mask_path"]
 
 
+def test_views_are_of_the_pixels_as_stored_and_may_come_from_windows(tmp_path):
+    folder = ngp_folder(tmp_path / "scene", [LENS], background=1.0, suffix=".png")
+    before = load_views(folder, resolution=24)
+    turned = Image.Exif()
+    turned[0x112] = 6
+    for path in folder.glob("images/*"):
+        with Image.open(path) as image:
+            image.save(path, exif=turned)
+    text = (folder / "transforms.json").read_text(encoding="utf-8")
+    (folder / "transforms.json").write_text(text.replace("images/", ".\\\\images\\\\"))
+    after = load_views(folder, resolution=24)
+    assert torch.equal(after.training.pictures, before.training.pictures)
+
+
+def test_views_without_transparency_among_others_are_told(tmp_path, caplog):
+    folder = nerf_folder(tmp_path / "scene", side=16)
+    first, second, *_ = sorted(folder.glob("train/*.png"))
+    for path in (first, second):
+        Image.new("RGB", (16, 16)).save(path)
+    load_views(folder, resolution=8)
+    text = "not cut out: the background of pictures without transparency, as others have some"
+    assert caplog.messages == [f"{first.parent}: {text}; it counts as the thing"]
+
+
 def edited(change, name="transforms_train.json"):
     def edit(folder):
         content = json.loads((folder / name).read_text(encoding="utf-8"))

@@ -59,13 +59,14 @@ class _Gltf:
 
     def __init__(self, file: MeshFile, content: bytes) -> None:
         self.file = file
-        # Without a material all is white, says glTF.
-        file.plain = 1.0
+        # Without a material all is white, and colour profiles of textures are ignored, says glTF.
+        file.plain, file.profiles = 1.0, False
         chunks = {b"JSON": content}
         if content[:4] == b"glTF":
-            self._check_version(struct.unpack_from("<I", content, 4)[0])
+            version, size = struct.unpack_from("<II", content, 4)
+            self._check_version(version)
             chunks, position = {}, 12
-            while position < len(content):
+            while position < min(size, len(content)):
                 length, kind = struct.unpack_from("<I4s", content, position)
                 position += 8 + length
                 if position > len(content):
@@ -316,6 +317,14 @@ class _Gltf:
         lowest, highest = factor[3], factor[3]
         if texture is not None:
             lowest, highest = lowest * texture.lowest_alpha, highest * texture.highest_alpha
+        # Factors and colours of vertices are linear.
+        linear = np.full((len(points), 3), factor[:3] if index is not None else np.nan)
+        if "COLOR_0" in attributes:
+            raw = self._raw(attributes["COLOR_0"])[used]
+            shades = raw / (1.0 if raw.dtype.kind == "f" else np.iinfo(raw.dtype).max)
+            linear = np.multiply(factor[:3], shades[:, :3])
+            alpha = shades[:, 3] if shades.shape[1] > 3 else np.ones(1)
+            lowest, highest = lowest * alpha.min(initial=1.0), highest * alpha.max(initial=0.0)
         mode, cut = material.get("alphaMode", "OPAQUE"), material.get("alphaCutoff", 0.5)
         if mode != "OPAQUE" and highest < (cut if mode == "MASK" else 1 / 255):
             name = shown(material.get("name", index))
@@ -323,12 +332,6 @@ class _Gltf:
             return None
         if mode != "OPAQUE" and lowest < 1.0:
             self.file.left_out("transparency: all is opaque")
-        # Factors and colours of vertices are linear.
-        linear = np.full((len(points), 3), factor[:3] if index is not None else np.nan)
-        if "COLOR_0" in attributes:
-            raw = self._raw(attributes["COLOR_0"])[used, :3]
-            top = 1.0 if raw.dtype.kind == "f" else np.iinfo(raw.dtype).max
-            linear = np.multiply(factor[:3], raw / top)
         part = Part(points, faces, srgb_values(linear.clip(0.0, 1.0))[faces])
         if texture is not None and uv is not None:
             part.uv, part.texture = uv[faces], texture.texture

@@ -55,6 +55,7 @@ DARK = 0.25
 
 _CLIPPED = 1.0 + 0.5 / 255.0
 _SRGB_GAMMA = 1.0 / 2.2
+_SRGB_PRIMARIES = (0.3127, 0.329, 0.64, 0.33, 0.3, 0.6, 0.15, 0.06)
 _MODES_OF_PROFILES = {"RGB": "RGB", "GRAY": "L", "CMYK": "CMYK", "Lab": "LAB"}
 # Tags of TIFF.
 _BITS, _PHOTOMETRIC, _PLANES, _COLOURS, _SUBFILES, _SAMPLE_FORMAT = 258, 262, 284, 320, 330, 339
@@ -104,13 +105,19 @@ def with_background(image: Image.Image) -> Image.Image:
     return Image.alpha_composite(white, image)
 
 
-def open_image(path: Path) -> Image.Image:
-    """Read a picture as RGBA, as it is."""
-    return decode_image(read_bytes(path, limit=_MAX_FILE, what="target"), label=str(path))
+def open_image(path: Path, *, upright: bool = True) -> Image.Image:
+    """Read a picture as RGBA, as it is; turned as its EXIF data say, unless not `upright`."""
+    content = read_bytes(path, limit=_MAX_FILE, what="target")
+    return decode_image(content, label=str(path), upright=upright)
 
 
-def decode_image(content: bytes, *, label: str) -> Image.Image:
-    """Return the picture in the bytes of a file as RGBA, as it is; errors call it `label`."""
+def decode_image(
+    content: bytes, *, label: str, upright: bool = True, profile: bool = True
+) -> Image.Image:
+    """Return the picture in the bytes of a file as RGBA, as it is; errors call it `label`.
+
+    It is turned as its EXIF data say, if `upright`. `profile`: its colour profile is applied.
+    """
     name = shown(label)
     if not content:
         raise NPAError(f"target {name} is an empty file (0 bytes): save the picture again")
@@ -123,7 +130,7 @@ def decode_image(content: bytes, *, label: str) -> Image.Image:
                 opened.load()
                 # A format inside of another may have another size.
                 _check_area(opened.size, name)
-                return _to_rgba(opened, content, label)
+                return _to_rgba(opened, content, label, upright=upright, profile=profile)
     except Image.DecompressionBombError as error:
         raise _too_large(name, "more") from error
     except UnidentifiedImageError as error:
@@ -180,33 +187,40 @@ def _too_large(name: str, got: str) -> NPAError:
 # Pixels: bit depths, floats, transparent colours, profiles.
 
 
-def _to_rgba(opened: ImageFile.ImageFile, content: bytes, name: str) -> Image.Image:
-    """Return a loaded picture as RGBA, upright, in sRGB; `content` has the bytes of its file.
+def _to_rgba(
+    opened: ImageFile.ImageFile, content: bytes, name: str, *, upright: bool, profile: bool
+) -> Image.Image:
+    """Return a loaded picture as RGBA, in sRGB; `content` has the bytes of its file.
 
     Samples are scaled by the file's bit depth; white is 1 for floats. A colour that a PNG names
-    transparent becomes so, and so does NaN. An embedded colour profile is applied. What is not
-    used is told by `left_out`, which calls the file `name`.
+    transparent becomes so, and so does NaN. `upright`: the picture is turned as its EXIF data say.
+    `profile`: an embedded colour profile is applied. What is not used is told by `left_out`, which
+    calls the file `name`.
     """
     tags: Any = getattr(opened, "tag_v2", {})
     kind = tags.get(_SAMPLE_FORMAT, (_FLOAT if opened.mode == "F" else 1,))[0]
     if getattr(opened, "is_animated", False) or _SUBFILES in tags:
         left_out(name, "all its frames, pages or pictures but the first")
     is_png = opened.format == "PNG"
-    image = ImageOps.exif_transpose(opened)
+    image = ImageOps.exif_transpose(opened) if upright else opened.copy()
+    deep = (content[24] if is_png else max(tags.get(_BITS, (8,)))) > 8
     palette = tags.get(_COLOURS, ()) if image.mode == "P" else ()
     if 0 < max(palette, default=0) < 256:
         # Some programs write colours of 8 bits, of which Pillow takes the upper half of 16.
         image.putpalette(np.array(palette, np.uint8).reshape(3, -1).T.tobytes())
-    there = _not_transparent(image, content) if is_png else None
+    there = _not_transparent(image, content, upright) if is_png else None
     if image.mode.startswith("I") or image.mode == "F" or kind == _SIGNED:
         # Pillow scales the samples of PGM files to 16 bits, and inverts up to 8 bits only.
         bits, inverted = tags.get(_BITS, (16,))[0], tags.get(_PHOTOMETRIC) == 0
         image, numbers = _to_eight_bits(image, kind, bits, inverted, name)
-        there = numbers if there is None else there & numbers
+        there, deep = numbers if there is None else there & numbers, False
     if image.mode == "La":
         image = image.convert("LA")
     rgba = image.convert("RGB" if image.mode in ("LAB", "CMYK") else "RGBA").convert("RGBA")
-    if image.info.get("icc_profile"):
+    if deep and (top := int(np.asarray(rgba)[..., :3].max())) < 255 * DARK:
+        # Pillow has cut colours to 8 bits.
+        left_out(name, f"its largest value is {top} of 255: scale its values", what="dark")
+    if profile and image.info.get("icc_profile"):
         grey, other = image.mode in ("1", "L", "LA"), image.mode in ("LAB", "CMYK")
         own = image.convert("L") if grey else image if other else rgba.convert("RGB")
         if (colours := _in_srgb(own, image.info["icc_profile"], name)) is not None:
@@ -216,6 +230,10 @@ def _to_rgba(opened: ImageFile.ImageFile, content: bytes, name: str) -> Image.Im
         gamma = image.info.get("gamma", _SRGB_GAMMA)
         if abs(gamma / _SRGB_GAMMA - 1.0) > 0.05:
             left_out(name, f"its gamma of {gamma:g}; colours are read as sRGB")
+        primaries = image.info.get("chromaticity", _SRGB_PRIMARIES)
+        code = content.partition(b"IDAT")[0].partition(b"cICP")[2][:2]
+        if not np.allclose(primaries, _SRGB_PRIMARIES, atol=0.01) or code not in (b"", b"\1\r"):
+            left_out(name, "its primaries (cHRM or cICP); colours are read as sRGB")
     if there is not None:
         alpha = np.asarray(rgba.getchannel("A")) * there
         rgba.putalpha(Image.fromarray(alpha.astype(np.uint8)))
@@ -274,8 +292,8 @@ def _to_eight_bits(
         if outside.any():
             left_out(name, f"{text}, at {outside.sum()} of {outside.size} pixels")
     if inverted:
-        levels = 1.0 - levels
-    elif 0.0 < largest < DARK:
+        levels, largest = 1.0 - levels, 1.0 - float(values.min(initial=1.0))
+    if 0.0 < largest < DARK:
         text = f"its largest value is {largest * white:g} of {white:.10g}: scale its values"
         left_out(name, text, what="dark")
     levels = np.where(numbers, levels, 0.0) * 255.0
@@ -284,7 +302,7 @@ def _to_eight_bits(
     return grey, numbers
 
 
-def _not_transparent(image: Image.Image, content: bytes) -> Mask | None:
+def _not_transparent(image: Image.Image, content: bytes, upright: bool) -> Mask | None:
     """Return where a PNG's pixels have another colour than the transparent one of tRNS, [H, W].
 
     None: Pillow makes them transparent itself. It compares grey of 2 and 4 bits, which it has
@@ -303,7 +321,7 @@ def _not_transparent(image: Image.Image, content: bytes) -> Mask | None:
         with Image.open(io.BytesIO(content), formats=("PNG",)) as low:
             # The same decoder, told that the other byte of each sample is the higher one.
             low.tile = [tile._replace(args="RGB;16L") for tile in low.tile]
-            lower = np.asarray(ImageOps.exif_transpose(low))
+            lower = np.asarray(ImageOps.exif_transpose(low) if upright else low)
         samples = samples.astype(np.uint16) * 256 + lower
     different = samples.reshape(*samples.shape[:2], -1) != np.array(transparent)
     return np.asarray(different.any(axis=-1))

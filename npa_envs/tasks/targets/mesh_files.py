@@ -391,6 +391,8 @@ def _apply(file: MeshFile, material: dict[str, list[str]], part: Part, uv: Float
         if any(light) and not any(colour):
             file.left_out("light: what a black material emits is read as its colour")
             colour = light
+        if min(colour) < 1.0 and np.isfinite(part.colours).any():
+            file.left_out("colours of materials where corners have some")
         part.colours = np.where(np.isnan(part.colours), colour, part.colours)
     if any(alpha) or "map_d" in material or (texture is not None and texture.lowest_alpha < 1.0):
         file.left_out("transparency: all is opaque")
@@ -424,9 +426,12 @@ def _read_off(file: MeshFile, content: bytes) -> list[Part]:
     rows, of_corners = [row[int(row[0]) + 1 :] for row in faces], False
     if corners and all(len(row) >= least for row in corners):
         rows, of_corners = [row[start:] for row in corners], True
-    shades = np.array([(row + ["nan"] * 3)[:3] for row in rows], dtype=np.float64).reshape(-1, 3)
+    shades = np.array([(row + ["nan"] * 4)[:4] for row in rows], dtype=np.float64).reshape(-1, 4)
     # Negative ones are normals.
     shades = unit_colours(np.where((shades < 0).any(), np.nan, shades))
+    if (shades[:, 3] < 1.0).any():
+        file.left_out("transparency: all is opaque")
+    shades = shades[:, :3]
     colours = shades[flat[places]] if of_corners else np.repeat(shades[owners][:, None], 3, axis=1)
     return [Part(vertices, flat[places], colours)]
 

@@ -64,6 +64,8 @@ class MeshFile:
         self.path = path
         self.plain = 0.6
         """Red, green and blue of triangles without a colour."""
+        self.profiles = True
+        """Whether the colour profiles of textures are applied."""
         self.materials: set[object] = set()
         """The materials of triangles that were read."""
         self._textures: dict[tuple[str, tuple[Wrap, Wrap]], FileTexture | None] = {}
@@ -128,7 +130,7 @@ class MeshFile:
             content = read()
             if content is None:
                 raise NPAError(f"{shown(label)} is not there: put it beside the file")
-            image = decode_image(content, label=label)
+            image = decode_image(content, label=label, profile=self.profiles)
             self._texels += image.width * image.height
             if self._texels > _MAX_TEXELS:
                 raise NPAError(f"textures must have at most {_MAX_TEXELS} pixels: reduce them")

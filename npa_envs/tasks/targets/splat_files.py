@@ -88,8 +88,9 @@ def ply_kind(path: Path) -> str:
     with open_regular(path, limit=MAX_FILE, what="target") as file:
         header, end, _ = file.read(_HEADER).partition(b"end_header")
     text = header.decode("latin-1")
-    rows = {name: int(count) for name, count in re.findall(r"element\s+(\w+)\s+(\d+)\s", text)}
-    names = set(re.findall(r"property\s+\w+\s+(\w+)\s", text))
+    counts = re.findall(r"(?<=[\r\n])element\s+(\w+)\s+(\d+)\s", text)
+    rows = {name: int(count) for name, count in counts}
+    names = set(re.findall(r"(?<=[\r\n])property\s+\w+\s+(\w+)\s", text))
     if not end or any(rows.get(name) for name in ("face", "tristrips")) or not rows.get("vertex"):
         return "triangles"
     trained = {"opacity", "scale_0", "rot_0"} <= names or "packed_position" in names

@@ -251,7 +251,7 @@ def _read_view_folder(
         )
     for views in (training, measured):
         views.cameras.world_to_camera[:, :3, 3] *= RADIUS / radius
-    first, how = open_image(frames[0].picture), "alpha"
+    first, how = open_image(frames[0].picture, upright=False), "alpha"
     if background is not None:
         how = f"their plain background, sRGB {background.astype(int).tolist()}"
     counts = f"{len(frames)} views to train with, {len(others)} held out"
@@ -341,7 +341,7 @@ def _read_frame(path: Path, number: int, frame: Any, content: dict[str, Any]) ->
         pose = torch.tensor(matrix, dtype=torch.float64)
     if pose.shape != (4, 4):
         raise NPAError(f"transform_matrix of {where} must be 4 x 4 numbers, got {shown(matrix)}")
-    inside = os.path.normpath(name)
+    inside = os.path.normpath(name.replace("\\", "/"))
     if os.path.isabs(name) or inside == os.curdir or inside.split(os.sep)[0] == os.pardir:
         raise NPAError(
             f"file_path of {where} must name a file in that folder, got {shown(name)}: put the "
@@ -425,7 +425,7 @@ def _plain_background(folder: Path, frames: Sequence[FolderView]) -> FloatImage 
     """Return the colour behind the thing in opaque pictures, [3]; None: they have transparency."""
     edges = []
     for frame in frames:
-        image = open_image(frame.picture)
+        image = open_image(frame.picture, upright=False)
         if is_cut_out(image):
             return None
         rgb = np.asarray(image.convert("RGB"))
@@ -468,7 +468,8 @@ def _square_view(
     frame: FolderView, resolution: int, background: FloatImage | None
 ) -> tuple[FloatImage, NDArray[np.float64]]:
     """Return the picture of a frame, [R, R, 4], without distortion, and its fx, fy, cx and cy."""
-    image = open_image(frame.picture)
+    # Cameras are those of the pixels as stored.
+    image = open_image(frame.picture, upright=False)
     size, (pinhole, distortion) = image.size, _lens_of(frame, image.size)
     if background is not None or any(distortion):
         # No larger than needed, as what follows takes time.
@@ -477,6 +478,9 @@ def _square_view(
         pinhole = pinhole * np.tile(np.divide(image.size, size), 2)
     if background is not None:
         image = cut_out(image, background)
+    elif not is_cut_out(image):
+        text = "the background of pictures without transparency, as others have some"
+        left_out(str(frame.picture.parent), f"{text}; it counts as the thing", what="not cut out")
     if any(distortion):
         image = _undistorted(image, pinhole, distortion)
     width, height = image.size
