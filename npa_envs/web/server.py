@@ -317,7 +317,8 @@ class ViewerSession:
                     world = make()
             except NPAError as error:
                 self._send_error(str(error))
-                make = None if make is self._site.make_world else self._site.make_world
+                if make is not self._site.make_world:
+                    self._next_world = self._site.make_world
                 continue
             try:
                 self._run_world(world)
