@@ -98,7 +98,8 @@ def check_same_run(
     try:
         # Settings that the run does not have are newer than it is.
         unset = type(config)(task=type(config.task)())
-        theirs = _flat(config_to_dict(override(unset, **content["config"])))
+        stored = content["config"]
+        theirs = _flat(config_to_dict(override(unset, **stored | {"task": stored["task"]})))
     except (NPAError, TypeError, ValueError, KeyError, AttributeError, RecursionError) as error:
         raise unusable_checkpoint(path, f"config cannot be read ({shown(error)})") from error
     ours = _flat(config_to_dict(config))
