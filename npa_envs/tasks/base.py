@@ -366,7 +366,7 @@ PictureTask = Task
 class GrowthConfig(TaskConfig):
     """Settings of growth from a ball: target, damage in training, penalties of the loss.
 
-    Damage befalls worlds of the training pool, from which batches continue.
+    Training damages worlds of its pool, from which batches continue.
     """
 
     damage_radius: float = 0.0

@@ -59,6 +59,7 @@ GAUSSIAN_NAMES = (
 
 _HEADER = 2**16
 _REST = (0, 9, 24, 45)
+_TRAINED = {"opacity", "scale_0", "rot_0"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,7 +94,7 @@ def ply_kind(path: Path) -> str:
     names = set(re.findall(r"(?<=[\r\n])property\s+\w+\s+(\w+)\s", text))
     if not end or any(rows.get(name) for name in ("face", "tristrips")) or not rows.get("vertex"):
         return "triangles"
-    trained = {"opacity", "scale_0", "rot_0"} <= names or "packed_position" in names
+    trained = names >= _TRAINED or "packed_position" in names
     return "gaussians" if trained else "points"
 
 
@@ -107,8 +108,8 @@ def read_splats(path: Path) -> GaussianCloud:
         vertex = read_ply(read_bytes(path, limit=MAX_FILE, what="target"))[0]["vertex"]
         if "packed_position" in vertex:
             raise file.error("is compressed (packed_position): save it as an ordinary PLY")
-        trained = ply_kind(path) == "gaussians"
-        return (_trained_gaussians if trained else _points)(file, vertex)
+        read = _trained_gaussians if vertex.keys() >= _TRAINED else _points
+        return read(file, vertex)
 
 
 def _columns(file: MeshFile, vertex: Element, names: tuple[str, ...]) -> FloatArray:
