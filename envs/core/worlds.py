@@ -101,17 +101,14 @@ class BatchedWorlds(WorldState):
         random = self.next_streams(world_indices, keys)
         check_default_dtype()
         if not self.episodes.term_names:
-            return self._first_start(world_indices, random)
+            # The first episodes: the task must draw from no global generator.
+            with no_global_draws(self.task, start_method(self.task)):
+                start = self.task.start(random)
+            with no_global_draws(self.task, "losses"):
+                return self._begun(world_indices, random, start, check=True)
         # On CUDA a start may be captured as a graph, so that checks must not synchronise.
         start = self.task.start(random)
         return self._begun(world_indices, random, start, check=not self.x.is_cuda)
-
-    def _first_start(self, world_indices: Tensor, random: WorldRandom) -> Start:
-        """Start the first episodes, and check that the task draws from no global generator."""
-        with no_global_draws(self.task, start_method(self.task)):
-            start = self.task.start(random)
-        with no_global_draws(self.task, "losses"):
-            return self._begun(world_indices, random, start, check=True)
 
     def _begun(self, indices: Tensor, random: WorldRandom, start: Start, *, check: bool) -> Start:
         check_start(self.task, start, len(indices), (self.x.shape, self.s.shape))

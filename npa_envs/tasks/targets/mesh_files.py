@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import io
 import math
 import re
@@ -240,9 +239,7 @@ def _read_ply_parts(file: MeshFile, content: bytes) -> list[Part]:
     for number in np.unique(numbers):
         chosen, texture = numbers == number, None
         if uv is not None and 0 <= number < len(names):
-            name = names[int(number)]
-            read = functools.partial(file.neighbour, name)
-            texture = file.texture(name, read, ("repeat", "repeat"))
+            texture = file.texture(names[int(number)])
         if texture is None or uv is None:
             part = Part(vertices, faces[chosen], None if colours is None else colours[chosen])
         else:
@@ -372,10 +369,9 @@ def _apply(file: MeshFile, material: dict[str, list[str]], part: Part, uv: Float
     except ValueError:
         file.left_out("colours that are no numbers")
         colour, light, alpha = [], [], []
-    texture, line = None, " ".join(material.get("map_kd", []))
+    line = " ".join(material.get("map_kd", []))
     name = _OPTIONS.sub("", line, count=1)
-    if name:
-        texture = file.texture(name, lambda: file.neighbour(name), ("repeat", "repeat"))
+    texture = file.texture(name) if name else None
     if texture is not None:
         part.texture = texture.texture
         # In this format v goes up.

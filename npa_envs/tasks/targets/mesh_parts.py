@@ -117,17 +117,21 @@ class MeshFile:
         return None
 
     def texture(
-        self, name: str, read: Callable[[], bytes | None], wrap: tuple[Wrap, Wrap]
+        self,
+        name: str,
+        read: Callable[[], bytes | None] | None = None,
+        wrap: tuple[Wrap, Wrap] = ("repeat", "repeat"),
     ) -> FileTexture | None:
         """Return a texture, None after a warning if it is missing or damaged.
 
-        `name` identifies it in this file.
+        `name` identifies it in this file. `read` returns its bytes; None: it is the `neighbour` of
+        this name.
         """
         if (name, wrap) in self._textures:
             return self._textures[name, wrap]
         label, found = os.path.basename(name.replace("\\", "/")) or name, None
         try:
-            content = read()
+            content = self.neighbour(name) if read is None else read()
             if content is None:
                 raise NPAError(f"{shown(label)} is not there: put it beside the file")
             image = decode_image(content, label=label, profile=self.profiles)
