@@ -4,7 +4,6 @@ import errno
 import json
 import os
 import re
-import subprocess
 import sys
 from importlib import metadata
 from pathlib import Path
@@ -14,6 +13,7 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from support.processes import run_alone
 
 import npa_envs
 from npa_envs import registration
@@ -170,18 +170,6 @@ def test_the_command_line_works_without_utf8(tmp_path):
         done = run_alone(program, *words, PYTHONUTF8="0", LC_ALL="C")
         assert done.returncode == 0, done.stderr
         assert shown in done.stdout
-
-
-def run_alone(program, *words, **environment):
-    """Return the finished process of a program."""
-    return subprocess.run(
-        [sys.executable, "-c", program, *words],
-        env={**os.environ, **environment},
-        capture_output=True,
-        encoding="utf-8",
-        timeout=120,
-        check=False,
-    )
 
 
 def test_doctor_finds_packages_that_are_missing_or_old(monkeypatch):

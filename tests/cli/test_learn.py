@@ -5,11 +5,10 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
-from support.clock import Clock
+from support.clock import Clock, wait_until
 
 from npa_envs.cli import main
 from npa_envs.cli.common import problem_of
@@ -56,11 +55,7 @@ def test_a_killed_process_ends_a_run_and_a_signal_stops_it(tmp_path):
             [sys.executable, "-m", "npa_envs", *words],
             stdout=subprocess.PIPE, stderr=subprocess.STDOUT, encoding="utf-8",
         )  # fmt: skip
-        end = time.monotonic() + 60
-        while len(points(tmp_path)) < count:
-            assert run.poll() is None, run.stdout.read()
-            assert time.monotonic() < end
-            time.sleep(0.05)
+        wait_until(lambda: len(points(tmp_path)) >= count, 60, run)
         return run
 
     run = begun(2)

@@ -5,9 +5,9 @@ import os
 import signal
 import subprocess
 import sys
-import time
 
 import pytest
+from support.clock import wait_until
 
 from npa_envs.cli import main, sweep
 from npa_envs.cli.sweep import combinations
@@ -149,11 +149,7 @@ def in_a_terminal(tmp_path):
 def test_a_sweep_that_is_stopped_lets_its_runs_save_what_they_have(tmp_path, send, number):
     run = in_a_terminal(tmp_path)
     try:
-        end = time.monotonic() + 300
-        while len(list(tmp_path.glob("*/begun"))) < 2:
-            assert run.poll() is None, run.stdout.read()
-            assert time.monotonic() < end
-            time.sleep(0.05)
+        wait_until(lambda: len(list(tmp_path.glob("*/begun"))) == 2, 300, run)
         send(run.pid, number)
         output, _ = run.communicate(timeout=300)
     finally:

@@ -2,13 +2,12 @@
 
 import multiprocessing
 import os
-import subprocess
-import sys
 import threading
 import time
 
 import pytest
 import torch
+from support.processes import run_alone
 
 from npa_envs.compile_lock import kernel_lock
 from npa_envs.ops import cpu_threads
@@ -107,9 +106,7 @@ with multiprocessing.get_context("fork").Pool(2) as pool:
 
 def printed(program, threads):
     """Return the lines that a program prints in a process of its own."""
-    command, env = [sys.executable, "-c", ROLLOUT + program], {"OMP_NUM_THREADS": str(threads)}
-    options = {"capture_output": True, "encoding": "utf-8", "timeout": 60, "check": False}
-    done = subprocess.run(command, env={**os.environ, **env}, **options)
+    done = run_alone(ROLLOUT + program, OMP_NUM_THREADS=str(threads))
     assert done.returncode == 0, done.stderr
     return done.stdout.split("\n")[:-1]
 

@@ -4,8 +4,6 @@ import gzip
 import json
 import os
 import re
-import subprocess
-import sys
 import tracemalloc
 import zipfile
 from collections.abc import Callable
@@ -15,6 +13,7 @@ from typing import Any
 import pytest
 import torch
 from PIL import EpsImagePlugin, Image
+from support.processes import run_alone
 
 from npa_envs import NPAError, NPARule, load_rule, save_rule
 from npa_envs.measure.benchmark_records import read_record
@@ -154,9 +153,7 @@ def test_a_kernel_cache_that_cannot_be_made_is_named_with_its_hint(tmp_path):
     program = (
         "import torch, npa_envs\nnpa_envs.perceive(torch.rand(1, 2, 2), torch.rand(1, 2, 1), 0.1)"
     )
-    environment = os.environ | {"WARP_CACHE_PATH": str(tmp_path / "file")}
-    command = [sys.executable, "-c", program]
-    done = subprocess.run(command, env=environment, capture_output=True, encoding="utf-8")
+    done = run_alone(program, WARP_CACHE_PATH=str(tmp_path / "file"))
     assert re.search(rf"NPAError: .*{tmp_path / 'file'}.*remove it.*WARP_CACHE_PATH", done.stderr)
 
 

@@ -1,13 +1,13 @@
 """Importing the package is cheap: it starts no device and pulls in no heavy extra."""
 
 import re
-import subprocess
 import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 from support.learning_problems import heart
+from support.processes import run_alone
 
 from npa_envs import wrappers
 from npa_envs.agents.learning import Budget, train
@@ -90,7 +90,7 @@ def test_a_fresh_process_imports_no_more_than_is_asked_for(program, printed, pol
     monkeypatch.delenv("OMP_WAIT_POLICY", raising=False)
     if policy is not None:
         monkeypatch.setenv("OMP_WAIT_POLICY", policy)
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, encoding="utf-8")
+    done = run_alone(program)
     assert (done.stdout, done.stderr) == (printed, "")
 
 
@@ -106,7 +106,7 @@ print(sys.modules["warp._src.context"].runtime.get_clang_pch_dir())
 
 
 def test_warp_starts_without_a_word_of_a_missing_driver_and_removes_its_folders() -> None:
-    done = subprocess.run([sys.executable, "-c", WARP], capture_output=True, encoding="utf-8")
+    done = run_alone(WARP)
     assert done.stderr.splitlines()[0] == "two"
     assert not re.search("CUDA driver|ResourceWarning", done.stderr)
     assert not Path(done.stdout.splitlines()[-1]).exists()

@@ -7,7 +7,7 @@ import torch
 from support.circle_task import CircleTask, circle_config
 from support.refusals import refused
 from support.training_runs import train
-from support.worlds import assert_near, assert_same, lively_rule, random_world
+from support.worlds import assert_near, assert_same, lively_rule, random_world, seeded
 
 import npa_envs
 from npa_envs import NPAError, NPARule
@@ -174,10 +174,6 @@ class TestRest:
     def worlds(self, device):
         return random_world(2, 50, 2, 4, dtype=torch.float32, device=device)
 
-    @staticmethod
-    def generator(device):
-        return torch.Generator(device).manual_seed(5)
-
     def test_worlds_at_rest_are_recognised(self, rule, worlds):
         assert not npa_envs.at_rest(rule, *worlds, eps=0.3).any()
         x, s = npa_envs.rollout(rule, *worlds, 200, eps=0.3)
@@ -192,7 +188,7 @@ class TestRest:
         results = []
         for fewest in (10**9, 256):
             monkeypatch.setattr(rollout_execution, "MIN_RESTING", fewest)
-            generator = self.generator(device)
+            generator = seeded(5, device)
             if by_world:
                 generator = npa_envs.WorldRandom([3, 4], device=device)
             result, (x, s) = [], worlds
@@ -251,7 +247,7 @@ class TestRest:
         s[1, 5, 3] = 4.0
         for zone in (0.02, 0.0):
             rule.dead_zone = zone
-            after, _ = npa_envs.rollout(rule, x, s, 600, eps=0.3, generator=self.generator(device))
+            after, _ = npa_envs.rollout(rule, x, s, 600, eps=0.3, generator=seeded(5, device))
             assert after.isfinite().flatten(1).all(dim=1).tolist() == [True, False]
         assert parts[:2] == [1, 64]
         assert parts[-1] == 600
@@ -263,7 +259,7 @@ class TestRest:
         options = {"eps": 0.3, "box": 1.4, "dt": 0.01}
         skipping, every = (
             npa_envs.rollout(
-                rule, x + 3.3, 0.1 * s, steps, generator=self.generator(device), **options, **more
+                rule, x + 3.3, 0.1 * s, steps, generator=seeded(5, device), **options, **more
             )
             for more in ({}, {"return_path_length": True})
         )

@@ -1,4 +1,6 @@
-"""A fake clock for tests of time budgets."""
+"""A fake clock for tests of time budgets, and waiting by the real one."""
+
+import time
 
 
 class Clock:
@@ -18,3 +20,13 @@ class Clock:
 
     def sleep(self, seconds):
         self.now += seconds
+
+
+def wait_until(condition, seconds=300.0, run=None):
+    """Return a condition's value once it is true; a process `run` must live until then."""
+    end = time.monotonic() + seconds
+    while not (value := condition()):
+        assert run is None or run.poll() is None, run.stdout.read()
+        assert time.monotonic() < end, "never true"
+        time.sleep(0.05)
+    return value

@@ -1,7 +1,9 @@
-"""Forked processes that share a distributed training run."""
+"""Programs in a process of their own, and forks that share a distributed training run."""
 
 import multiprocessing
 import os
+import subprocess
+import sys
 import traceback
 
 import pytest
@@ -9,6 +11,18 @@ import torch
 import torch.distributed as dist
 
 from npa_envs.errors import NPAError
+
+
+def run_alone(program, *words, **environment):
+    """Return the finished process of a program."""
+    return subprocess.run(
+        [sys.executable, "-c", program, *words],
+        env={**os.environ, **environment},
+        capture_output=True,
+        encoding="utf-8",
+        timeout=120,
+        check=False,
+    )
 
 
 def on_ranks(count, function, folder):

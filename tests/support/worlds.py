@@ -32,6 +32,11 @@ def relative_error(value, expected):
     return float(difference.norm() / expected.detach().cpu().double().norm())
 
 
+def seeded(seed=0, device="cpu"):
+    """Return torch's generator of a device, with a seed."""
+    return torch.Generator(device).manual_seed(seed)
+
+
 def random_world(world_count, particle_count, space_dim, state_dim, *, dtype, device, seed=0):
     """Return worlds with about twenty neighbours at eps 0.3, positions in [-0.7, 0.7]^D."""
     generator = torch.Generator().manual_seed(seed)

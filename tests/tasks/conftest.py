@@ -1,7 +1,14 @@
-"""Data that several files of this folder share."""
+"""Data that several files of this folder share, and notes of files that each test gets anew."""
 
 import pytest
 from support.small_digits import write_idx
+
+from npa_envs.tasks.targets.notes import left_out
+
+
+@pytest.fixture(autouse=True)
+def _told_again():
+    left_out.cache_clear()
 
 
 @pytest.fixture(scope="session")

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 from support import small_envs
+from support.worlds import seeded
 
 from npa_envs import load_rule
 from npa_envs.errors import NPAError
@@ -40,10 +41,6 @@ def test_generator_of_another_device_is_a_clear_error():
     x = torch.zeros(1, 4, 2, device="cuda")
     with pytest.raises(NPAError, match=r"generator must be on the worlds' device"):
         damage_worlds(Particles(x, x), kind="wipe", generator=torch.Generator())
-
-
-def seeded(seed, device="cpu"):
-    return torch.Generator(device).manual_seed(seed)
 
 
 def worlds(count, space_dim=2, particles=200):

@@ -7,6 +7,7 @@ import pytest
 import torch
 from PIL import Image
 from support.training_runs import make_cycle
+from support.worlds import seeded
 
 import npa_envs
 from npa_envs.cli import main
@@ -32,10 +33,6 @@ def config_of(**fields):
 
 def task_of(device="cpu", **fields):
     return ManyPictures(config_of(**fields), device=device)
-
-
-def generator(seed=0, device="cpu"):
-    return torch.Generator(device).manual_seed(seed)
 
 
 def test_a_folder_stands_for_its_pictures(tmp_path):
@@ -76,9 +73,9 @@ def test_each_world_is_compared_with_its_own_target(device):
 
 def test_gradients_of_the_loss_reach_the_worlds_codes_alone(device):
     task = task_of(device)
-    rule = task.make_rule(generator()).to(device)
+    rule = task.make_rule(seeded()).to(device)
     task = task.for_rule(rule)
-    x, s, *_, goal = task.seed(2, generator=generator(1, device), device=device)
+    x, s, *_, goal = task.seed(2, generator=seeded(1, device), device=device)
     goal.fill_(1)
     aimed = task.with_goal(goal)
     s = aimed.with_target_code(s)
@@ -93,15 +90,15 @@ def test_gradients_of_the_loss_reach_the_worlds_codes_alone(device):
 
 def test_switched_worlds_get_another_goal_and_its_code(device):
     task = task_of(device, switch_share=1.0, targets=("heart", "ring"))
-    task = task.for_rule(task.make_rule(generator()).to(device))
-    x, s, *_, goal = task.seed(16, generator=generator(1, device), device=device)
-    _, hurt, _, switched = task.damage(Particles(x, s, goal=goal), generator(2, device))
+    task = task.for_rule(task.make_rule(seeded()).to(device))
+    x, s, *_, goal = task.seed(16, generator=seeded(1, device), device=device)
+    _, hurt, _, switched = task.damage(Particles(x, s, goal=goal), seeded(2, device))
     assert 0 < int((switched != goal).sum()) < 16
     after = task.with_goal(switched).with_target_code(hurt)
     codes = after[..., :3].unique(dim=1)[:, 0]
     assert len(codes.unique(dim=0)) == 2
     steady = task_of(device, switch_share=0.0)
-    assert torch.equal(steady.damage(Particles(x, s, goal=goal), generator(2, device)).goal, goal)
+    assert torch.equal(steady.damage(Particles(x, s, goal=goal), seeded(2, device)).goal, goal)
 
 
 @pytest.mark.parametrize("encoder", [False, True])
@@ -151,7 +148,7 @@ def test_the_command_trains_and_evaluates_by_name(tmp_path, capsys):
     assert rule.state_dim == 8
     task = task_of_rule(f"{out}/rule.safetensors", rule, torch.device("cpu"), target="ring").task
     assert task.target.name == "ring"
-    _, s, *_ = task.seed(1, generator=generator())
+    _, s, *_ = task.seed(1, generator=seeded())
     assert torch.equal(s[0, :, :3], rule.codes["ring"].expand(48, 3))
     first = task_of_rule(f"{out}/rule.safetensors", rule, torch.device("cpu")).task
     assert first.target.name == "heart"

@@ -14,7 +14,6 @@ from PIL import Image, ImageCms
 from npa_envs.errors import NPAError
 from npa_envs.tasks.targets.mesh_parts import triangulated
 from npa_envs.tasks.targets.meshes import RADIUS, load_mesh
-from npa_envs.tasks.targets.notes import left_out
 from npa_envs.tasks.targets.views import load_views
 
 CUBE = np.array([(x, y, z) for z in (0, 1) for y in (0, 1) for x in (0, 1)], dtype=np.float32)
@@ -23,11 +22,6 @@ TRIANGLES = np.array([t for a, b, c, d in SIDES for t in ((a, b, c), (a, c, d))]
 CUBE_AREA = 6 * (2 * RADIUS / math.sqrt(3)) ** 2
 ORANGE = (200, 50, 20)
 ORANGE_FACTOR = [0.57758044, 0.03189603, 0.00699541, 1.0]
-
-
-@pytest.fixture(autouse=True)
-def _told_again():
-    left_out.cache_clear()
 
 
 def volume(mesh):

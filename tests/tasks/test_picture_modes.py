@@ -12,7 +12,6 @@ from PIL import Image, ImageCms, TiffImagePlugin, TiffTags, features
 
 from npa_envs.errors import MissingDependencyError, NPAError
 from npa_envs.tasks.targets.images import open_image, read_image
-from npa_envs.tasks.targets.notes import left_out
 from npa_envs.tasks.targets.picture_points import load_target
 from npa_envs.tasks.targets.textures import load_texture
 
@@ -20,11 +19,6 @@ ROWS, COLUMNS = np.mgrid[:32, :32] - 15.5
 DISK = np.hypot(ROWS, COLUMNS) < 10
 RING = DISK & (np.hypot(ROWS, COLUMNS) > 5)
 INSIDE, OUTSIDE = (16, 8), (0, 0)
-
-
-@pytest.fixture(autouse=True)
-def told_anew():
-    left_out.cache_clear()
 
 
 def write_png(path, samples, depth, colour_type, *chunks):

@@ -5,6 +5,7 @@ import json
 import pytest
 import torch
 from support.training_runs import make_cycle
+from support.worlds import seeded
 
 from npa_envs.cli import main
 from npa_envs.errors import NPAError
@@ -46,13 +47,9 @@ def assert_goals_fit(x, goals, clouds):
         assert set(clouds.label[same].tolist()) == {int(goal)}
 
 
-def random(seed=0, device="cpu"):
-    return torch.Generator(device).manual_seed(seed)
-
-
 def test_pictures_have_room_around_the_ink():
     task = PointClassification(PointClassificationConfig(particle_count=64, resolution=32))
-    x, s, *_ = task.seed(32, generator=random())
+    x, s, *_ = task.seed(32, generator=seeded())
     assert float(x.amax()) > 0.99
     density = task.picture(x, s)[..., 3]
     inner = density[:, 1:-1, 1:-1]
@@ -61,7 +58,7 @@ def test_pictures_have_room_around_the_ink():
 
 
 def test_worlds_are_clouds_of_their_class_with_blank_states(task, device):
-    x, s, *_, goal = task.seed(50, generator=random(1, device), device=device)
+    x, s, *_, goal = task.seed(50, generator=seeded(1, device), device=device)
     assert s.shape == (50, 24, 6)
     assert not s.any()
     assert_goals_fit(x, goal, task.clouds)
@@ -72,13 +69,13 @@ def test_test_clouds_are_others_and_never_varied(folder):
     task = task_of(folder, rotation=90.0, jitter=0.1)
     for part, count in ((task, 36), (task.held_out(), 18)):
         assert len(part.clouds.label) == count
-        x, *_ = part.seed(5, generator=random())
+        x, *_ = part.seed(5, generator=seeded())
         is_cloud = [bool((part.clouds.x == cloud).flatten(1).all(1).any()) for cloud in x]
         assert is_cloud == [part is not task] * 5
 
 
 def test_loss_is_the_error_to_the_class_and_the_overflow(task, device):
-    rule = task.make_rule(random()).to(device).double()
+    rule = task.make_rule(seeded()).to(device).double()
     goal = torch.tensor([2, 0], device=device)
     aimed = task.for_rule(rule).with_goal(goal)
     s = 2.0 * torch.randn(2, 24, 6, dtype=torch.float64, device=device)
@@ -157,9 +154,9 @@ def test_so_many_worlds_of_a_batch_are_fresh_clouds(folder, tmp_path, fraction, 
 
 def test_mutated_worlds_keep_their_states(folder):
     task = task_of(folder, mutated_share=0.5)
-    x, s, *_, goal = task.seed(200, generator=random(1))
+    x, s, *_, goal = task.seed(200, generator=seeded(1))
     s = s + torch.arange(200.0)[:, None, None]
-    new_x, new_s, _, new_goal = task.damage(Particles(x, s, goal=goal), random(2))
+    new_x, new_s, _, new_goal = task.damage(Particles(x, s, goal=goal), seeded(2))
     assert torch.equal(new_s, s)
     moved = (new_x != x).flatten(1).any(1)
     # Half of 200, less one in 36 that becomes what it was: 97 ± 7.
@@ -170,7 +167,7 @@ def test_mutated_worlds_keep_their_states(folder):
 
 def test_accuracies_are_those_of_a_rollout(folder, device):
     task = task_of(folder, device, readout_hidden_dim=5, update_prob=1.0).held_out()
-    rule = task.make_rule(random(3))
+    rule = task.make_rule(seeded(3))
     with torch.no_grad():
         for parameter in rule.parameters():
             parameter.mul_(10.0)
@@ -199,7 +196,7 @@ def test_clouds_are_cut_and_mutated_as_told():
         _partners(torch.tensor([1, 1, 0, 1]))
     x, other = torch.rand(5, 8, 2), torch.rand(5, 8, 2)
     s = x.sum(-1, keepdim=True)
-    cut_x, cut_s = _cut(x, s, random())
+    cut_x, cut_s = _cut(x, s, seeded())
     assert cut_x.shape == (5, 6, 2)
     torch.testing.assert_close(cut_x.sum(-1, keepdim=True), cut_s)
     new_x, new_s = _chimera(x, s, other)
@@ -255,7 +252,7 @@ def test_the_commands_measure_and_film_a_rule_that_classifies(trained, tmp_path,
 
 def test_a_static_rule_of_no_known_task_is_refused(task, tmp_path, capsys):
     path = tmp_path / "rule.safetensors"
-    save_rule(task.make_rule(random()), path)
+    save_rule(task.make_rule(seeded()), path)
     assert main(["evaluate", str(path), "--no-progress"]) != 0
     message = "runs moving rules in the 2D worlds of morphogenesis2d, got space_dim=2, static=True"
     assert message in capsys.readouterr().err

@@ -238,7 +238,6 @@ def test_joined_emoji_is_one_picture_and_two_emoji_are_a_clear_error():
 
 
 def test_what_was_left_out_of_a_file_is_told_once(caplog):
-    left_out.cache_clear()
     for text in ("2 more pages", "2 more pages", "its mask"):
         left_out("scan.tif", text)
     assert caplog.messages == [

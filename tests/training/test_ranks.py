@@ -9,6 +9,7 @@ import time
 import pytest
 import torch
 import torch.distributed as dist
+from support.clock import wait_until
 from support.processes import on_ranks
 from support.training_runs import log_of
 from support.worlds import assert_same
@@ -335,9 +336,7 @@ def test_a_process_or_store_that_falls_silent_is_missed(codes, capfd, make, mess
     first, *others = (Heartbeat(store, rank, 3) for rank in range(1 if own else 3))
     for other, finished in zip(others, (True, False), strict=not own):
         other.end(finished=finished)
-    end = time.monotonic() + 60.0
-    while not codes and time.monotonic() < end:
-        time.sleep(0.01)
+    wait_until(lambda: codes, 60)
     assert set(codes) == {LOST_CODE}
     if own:
         store.thawed.set()

@@ -11,6 +11,7 @@ import time
 from pathlib import Path
 
 import pytest
+from support.clock import wait_until
 
 from npa_envs.training.checkpoint import load_checkpoint
 
@@ -64,23 +65,15 @@ def last_iteration(out):
     return json.loads(lines[-1])["iteration"] if lines else 0
 
 
-def wait_until(condition, seconds=60):
-    end = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < end, "this took too long"
-        time.sleep(0.05)
-
-
 def grown(run, out, start):
     """Wait until a run has gone some way beyond an iteration; return its processes."""
-    wait_until(lambda: run.poll() is not None or last_iteration(out) > start + INTERVAL)
-    assert run.poll() is None, run.stdout.read()
+    wait_until(lambda: last_iteration(out) > start + INTERVAL, 60, run)
     return children(run.pid)
 
 
 def check_left(out, workers, before):
     """Nothing of a run that has ended is left but a checkpoint of late."""
-    wait_until(lambda: not any(map(alive, workers)))
+    wait_until(lambda: not any(map(alive, workers)), 60)
     saved = load_checkpoint(out / "checkpoint.pt")["iteration"]
     assert saved >= last_iteration(out) - INTERVAL > before - INTERVAL
     return saved

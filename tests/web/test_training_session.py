@@ -10,7 +10,6 @@ import signal
 import subprocess
 import sys
 import threading
-import time
 import urllib.request
 from pathlib import Path
 
@@ -19,6 +18,7 @@ import pytest
 import torch
 from PIL import Image
 from support.browser import DESK
+from support.clock import wait_until
 
 from npa_envs import NPAError, load_rule, save_rule
 from npa_envs.rule.files import rule_metadata, shipped_rules
@@ -73,14 +73,6 @@ def held(tmp_path, monkeypatch):
 def client_of(training, host="127.0.0.1"):
     site = server.Site(lambda: None, films=training._folder, host=host, training=training)
     return site, testclient.TestClient(server.make_app(site), base_url=HERE)
-
-
-def wait_until(condition, seconds=300.0):
-    end = time.monotonic() + seconds
-    while not (value := condition()):
-        assert time.monotonic() < end, "never true"
-        time.sleep(0.05)
-    return value
 
 
 def ended(training) -> dict:

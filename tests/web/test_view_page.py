@@ -15,6 +15,7 @@ import pytest
 import torch
 from PIL import Image
 from support.browser import DESK, PHONE
+from support.clock import wait_until
 
 pytest.importorskip("uvicorn")
 
@@ -175,10 +176,7 @@ def test_a_recording_yields_a_film_and_a_snapshot_a_picture(shown, tmp_path):
         assert len(np.unique(np.asarray(frames.convert("RGB")).reshape(-1, 3), axis=0)) > 20
     click(page, "snapshot")
     page.wait("document.querySelectorAll('#files a').length === 3")
-    deadline = time.monotonic() + 60
-    while not list(tmp_path.glob("gecko-*.png")) and time.monotonic() < deadline:
-        time.sleep(0.05)
-    (path,) = tmp_path.glob("gecko-*.png")
+    (path,) = wait_until(lambda: list(tmp_path.glob("gecko-*.png")), 60)
     with Image.open(path) as picture:
         assert picture.size == (992, 800)
 

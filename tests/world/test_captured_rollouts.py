@@ -1,14 +1,12 @@
 """Captured rollouts: what they give is what launched ones give, bit for bit."""
 
 import functools
-import os
-import subprocess
-import sys
 import threading
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 import torch
+from support.processes import run_alone
 from support.worlds import random_world
 from torch.utils.checkpoint import checkpoint
 
@@ -468,9 +466,7 @@ envs.reset(seed=0)
 for _ in range(4):
     envs.step(torch.zeros(envs.action_space.shape))
 """
-    options = {"capture_output": True, "encoding": "utf-8", "timeout": 120, "check": False}
-    command = [sys.executable, "-c", code]
-    done = subprocess.run(command, env=os.environ | {name: value}, **options)
+    done = run_alone(code, **{name: value})
     assert done.returncode == 0, done.stderr[-2000:]
 
 

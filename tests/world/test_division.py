@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from support.worlds import assert_near, assert_same, lively_rule, random_world
+from support.worlds import assert_near, assert_same, lively_rule, random_world, seeded
 
 import npa_envs
 from npa_envs.errors import NPAError
@@ -19,10 +19,6 @@ def dividing_rule(device, odds=(0.0, -8.0), **options):
         rule.fate.bias.copy_(torch.tensor(odds))
         rule.fate.weight.normal_(std=0.1, generator=torch.Generator(device).manual_seed(0))
     return rule
-
-
-def seeded(device, seed=1):
-    return torch.Generator(device).manual_seed(seed)
 
 
 def third_full(device, particle_count=64, space_dim=2):
@@ -60,7 +56,7 @@ def test_what_lies_in_dead_slots_influences_nothing(update_prob, device):
         other[1][..., LIFE] = 0.0
         given = [torch.where(dead, new, own) for new, own in zip(other, (x, s), strict=True)]
         options = {"update_prob": update_prob, "return_path_length": True}
-        result.append(npa_envs.rollout(rule, *given, 6, generator=seeded(device), **options))
+        result.append(npa_envs.rollout(rule, *given, 6, generator=seeded(1, device), **options))
     assert_same(*result)
     assert int(living(result[0][1]).sum()) > int(living(s).sum())
 
@@ -71,7 +67,7 @@ def test_not_a_number_in_dead_slots_leaves_gradients_finite(device):
     gradients = []
     for fill in (0.0, float("nan")):
         start = torch.where(living(s)[..., None], s, fill).requires_grad_()
-        after = npa_envs.rollout(rule, x, start, 3, generator=seeded(device))
+        after = npa_envs.rollout(rule, x, start, 3, generator=seeded(1, device))
         loss = sum(part.square().sum() for part in after)
         weights = [start, rule.hidden.weight, rule.fate.weight]
         gradients.append(torch.autograd.grad(loss, weights))
@@ -201,7 +197,7 @@ def test_one_particle_fills_its_world_and_stays_within_it(device):
     x = torch.zeros(2, 60, 2, dtype=torch.float64, device=device)
     s = torch.zeros(2, 60, 6, dtype=torch.float64, device=device)
     s[:, 0, LIFE] = 1.0
-    x, s = npa_envs.rollout(rule, x, s, 100, keep_every=5, generator=seeded(device, 5))
+    x, s = npa_envs.rollout(rule, x, s, 100, keep_every=5, generator=seeded(5, device))
     assert (x.shape, s.shape) == ((20, 2, 60, 2), (20, 2, 60, 6))
     number = living(s).sum(dim=-1)
     assert number[0].max() < 30

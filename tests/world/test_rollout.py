@@ -12,6 +12,7 @@ from support.worlds import (
     lively_rule,
     random_world,
     relative_error,
+    seeded,
 )
 
 import npa_envs
@@ -95,10 +96,6 @@ def pulled(values):
     return sum((bar * v).sum() for bar, v in zip(cotangents(values), values, strict=True))
 
 
-def seeded(device, seed):
-    return torch.Generator(device).manual_seed(seed)
-
-
 @pytest.mark.parametrize("update_prob", [1.0, 0.4])
 @pytest.mark.parametrize("static", [False, True])
 @pytest.mark.parametrize("box", [None, (1.4, 1.8)])
@@ -112,7 +109,7 @@ def test_rollout_and_its_gradients_equal_plain_torch(
     terms = {"moment_correction": False} if inverse == "none" else {"moment_inverse": inverse}
     masks = None
     if update_prob < 1.0:
-        draws = seeded(device, 9)
+        draws = seeded(9, device)
         blank = torch.empty(2, 60, dtype=torch.uint8, device=device)
         masks = [blank.bernoulli_(update_prob, generator=draws).cpu().double() for _ in range(4)]
 
@@ -124,7 +121,7 @@ def test_rollout_and_its_gradients_equal_plain_torch(
         return result, torch.autograd.grad(pulled(result), inputs, allow_unused=True)
 
     expected, expected_gradients = run(plain_rollout, "cpu", masks=masks)
-    more = {"update_prob": update_prob, "generator": seeded(device, 9), "return_path_length": True}
+    more = {"update_prob": update_prob, "generator": seeded(9, device), "return_path_length": True}
     result, gradients = run(npa_envs.rollout, device, **more)
     assert_near(result, expected, 1e-12)
     for value, answer in zip(gradients, expected_gradients, strict=True):
