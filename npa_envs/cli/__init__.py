@@ -65,6 +65,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     # Read when torch is loaded. On a busy machine, threads that wait in busy loops make every
     # operation several times as slow.
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+    if not sys.stderr.isatty():
+        # Read when tqdm is loaded. Each update is kept in a log; its default is ten a second.
+        for name in ("TQDM_MININTERVAL", "TQDM_MAXINTERVAL"):
+            os.environ.setdefault(name, "30")
     # Not by `list`, which is the module of a command.
     words = [*(sys.argv[1:] if arguments is None else arguments)]
     for stream in (sys.stdout, sys.stderr):

@@ -9,6 +9,7 @@ import io
 import json
 import math
 import re
+import sys
 import tempfile
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
@@ -39,33 +40,56 @@ def parse_options(
 ) -> OptionsT:
     """Parse a command's arguments to the dataclass `cls`; options not given are as in `default`.
 
-    Ends the process after `--help`, and with code 2 for a wrong argument. The help begins with
-    `description`, by default the dataclass's docstring.
+    Ends the process after `--help`, and with code 2 for a wrong argument; raises NPAError for an
+    unknown option and where the dataclass does. The help begins with `description`, by default the
+    dataclass's docstring.
     """
     kwargs: dict[str, Any] = {} if default is None else {"default": default}
     kwargs["config"] = tyro.conf.OmitArgPrefixes, tyro.conf.DisallowNone, tyro.conf.SuppressFixed
     try:
-        options: OptionsT = tyro.cli(
-            cls,
-            prog=f"npa-envs {command}",
-            description=description or inspect.getdoc(cls),
-            args=arguments,
-            **kwargs,
-        )
+        # Kept back: tyro names Python's fields, and suggests an option only for very similar names.
+        with contextlib.redirect_stderr(io.StringIO()) as said:
+            options: OptionsT = tyro.cli(
+                cls,
+                prog=f"npa-envs {command}",
+                description=description or inspect.getdoc(cls),
+                args=arguments,
+                **kwargs,
+            )
     except SystemExit as end:
         if not end.code:
             raise
-        # tyro has said what is wrong, but suggests an option only for very similar names.
+        cause: BaseException | None = end
+        while cause is not None and not isinstance(cause, NPAError):
+            cause = cause.__context__
+        if cause is not None:
+            raise NPAError(_of_options(str(cause), arguments)) from end
         with contextlib.redirect_stdout(io.StringIO()) as text, contextlib.suppress(SystemExit):
             tyro.cli(cls, args=["--help"], **kwargs)
         known = set(re.findall("--([a-z][a-z0-9-]*)", text.getvalue()))
+        # Options by the first word of what they are, such as "Steps".
+        meant = re.findall(r"(?ms)^. --([a-z][a-z0-9-]*).*?\b([A-Z][a-z]+)\b", text.getvalue())
+        by_word = {word.lower(): name for name, word in reversed(meant)}
         for word in arguments:
             name = word.partition("=")[0].removeprefix("--").replace("_", "-")
             if word.startswith("--") and name not in known:
-                hint = suggest(name, known).partition("known: ")[0].replace("'", "'--", 1)
+                nearest = suggest(by_word.get(name, name), known).partition("known: ")[0]
+                hint = nearest.replace("'", "'--", 1)
                 raise NPAError(f"unknown option {word!r}: {hint or 'see --help'}") from end
+        print(said.getvalue(), end="", file=sys.stderr)
         raise
     return options
+
+
+def _of_options(message: str, arguments: Sequence[str]) -> str:
+    """Return an error about a dataclass's field with the option that was typed for it."""
+    name = message.partition(" ")[0]
+    for word in arguments:
+        option = word.partition("=")[0]
+        if option.removeprefix("--").replace("-", "_") == name:
+            # Tuples stay as Python writes them.
+            return re.sub(rf"^{name}\b|\b{name}=(?=[\w.-])", f"{option} ", message)
+    return message
 
 
 @dataclass(frozen=True, kw_only=True)
