@@ -87,7 +87,10 @@ class WoundRow:
 
     @property
     def summary(self) -> str:
-        """What has healed, as text."""
+        """What has healed, as text; where nothing was to heal, also what NaN means."""
+        if not self.changed:
+            nothing = f"none of {self.wounds} wounds changed the picture"
+            return f"{self.damage}: {nothing}, so nothing could heal (nan)"
         return (
             f"{self.damage}: healed at {self.healed} of {self.changed} places that the wound "
             f"changed; {self.changed} of {self.wounds} wounds changed the picture"

@@ -119,7 +119,8 @@ def read_state_dict(data: bytes) -> RuleParts:
     if missing or unknown:
         raise NPAError(
             f"the state dict{rule_type} must hold {sorted(required)}{more}; missing: "
-            f"{sorted(missing)}, unknown: {shown(sorted(map(str, unknown)))}"
+            f"{sorted(missing)}, unknown: {shown(sorted(map(str, unknown)))}: a file of another "
+            "model holds no rule; give the npa.pth of the authors' training, or a run's folder"
         )
     weights = {known[name]: _matrix(name, state[name]) for name in known if name in state}
     if known is _EQUIVARIANT_NAMES:

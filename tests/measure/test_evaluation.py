@@ -244,6 +244,7 @@ def test_wounds_that_change_nothing_do_not_count(monkeypatch):
     rows = healed_by(monkeypatch, heart_task(), ["whole"] * 4, wipe_radius=0.0, cut_gap=1e-6)
     assert [(row.wounds, row.changed, row.healed) for row in rows] == [(5, 0, 0)] * 2
     assert all(math.isnan(row.before) for row in rows)
+    assert rows[0].summary.startswith("cut, gap 1e-06: none of 5 wounds changed the picture")
 
 
 def test_a_cpu_has_six_places_in_one_world_and_every_number_is_checked():
