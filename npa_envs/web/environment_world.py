@@ -97,6 +97,7 @@ class EnvironmentWorld(LiveWorld):
             "dimension": self._physics.space_dim,
             "half_width": task.half_width if self.box is None else 0.5 * min(self.box),
             "spot": 0.7 * float(task.pixel_size),
+            "class_count": getattr(task.config, "class_count", 0),
             "damages": list(DAMAGE_SIZES) if self._physics.moving else ["wipe"],
             "capabilities": ["film", "loss"],
         }

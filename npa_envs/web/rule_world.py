@@ -160,6 +160,7 @@ class RuleWorld(LiveWorld):
             "rule": self.main.name,
             "others": [name for name in self._choices if self._may_join(name)],
             "species": [live_rule.name for live_rule in self.live_rules],
+            "class_count": getattr(self.task.config, "class_count", 0),
             "damages": list(DAMAGE_SIZES),
             "capabilities": ["film", *([] if self.trained.why_not_measurable else ["loss"])],
         }

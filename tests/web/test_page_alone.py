@@ -134,6 +134,11 @@ def test_all_that_a_page_shows_has_a_meaning(run):
     """)
     assert min(map(len, meanings)) > 20
     assert len(set(meanings)) == len(shows) - 2
+    classes = run("""
+        listen({ ...world, class_count: 11 });
+        return element("meaning").textContent;
+    """)
+    assert "0 red, 1 green, " in classes and ", 9 black, 10 red; grey" in classes
 
 
 def test_loading_is_shown_until_the_first_frame_and_the_key_f_shows_the_whole_world(run):

@@ -148,14 +148,14 @@ export class TrainingCard {
       reading: "Reading the file…", starting: "Starting the training…",
       learning: `Iteration ${iteration} of ${total}${left === undefined ? "" : `, ${duration(left)} left`}`,
     };
-    const stop = () => {
+    const stopping = this.stopping === id, stop = button("Stop", () => {
       this.send({ type: "training", action: "stop" });
       this.change({ stopping: id });
-    };
+    });
     return [
       this.heading(`Learning ${name}`), bar,
-      text(this.stopping === id ? "Stopping; what it has learned is saved…" : words[state]), text(note),
-      row(this.quality(), ...(has_rule && this.showing !== id ? [this.watch()] : []), button("Stop", stop)),
+      text(stopping ? "Stopping; what it has learned is saved…" : words[state]), text(note),
+      row(this.quality(), ...(has_rule && this.showing !== id ? [this.watch()] : []), ...(stopping ? [] : [stop])),
     ];
   }
 
