@@ -66,9 +66,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     # operation several times as slow.
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
     if not sys.stderr.isatty():
-        # Read when tqdm is loaded. Each update is kept in a log; its default is ten a second.
-        for name in ("TQDM_MININTERVAL", "TQDM_MAXINTERVAL"):
-            os.environ.setdefault(name, "30")
+        # Seconds between updates of a bar, each of which a log keeps; read when tqdm is loaded.
+        os.environ.setdefault("TQDM_MININTERVAL", "10")
     # Not by `list`, which is the module of a command.
     words = [*(sys.argv[1:] if arguments is None else arguments)]
     for stream in (sys.stdout, sys.stderr):

@@ -59,37 +59,32 @@ def parse_options(
     except SystemExit as end:
         if not end.code:
             raise
+        typed = [word for word in arguments if word.startswith("--")]
+        given = {word[2:].partition("=")[0].replace("_", "-"): word for word in typed}
         cause: BaseException | None = end
         while cause is not None and not isinstance(cause, NPAError):
             cause = cause.__context__
         if cause is not None:
-            raise NPAError(_of_options(str(cause), arguments)) from end
+            message, field = str(cause), str(cause).partition(" ")[0]
+            if word := given.get(field.replace("_", "-")):
+                # Named as typed; tuples stay as Python writes them.
+                pattern = rf"^{field}\b|\b{field}=(?=[\w.-])"
+                message = re.sub(pattern, f"{word.partition('=')[0]} ", message)
+            raise NPAError(message) from end
         with contextlib.redirect_stdout(io.StringIO()) as text, contextlib.suppress(SystemExit):
             tyro.cli(cls, args=["--help"], **kwargs)
         known = set(re.findall("--([a-z][a-z0-9-]*)", text.getvalue()))
         # Options by the first word of what they are, such as "Steps".
         meant = re.findall(r"(?ms)^. --([a-z][a-z0-9-]*).*?\b([A-Z][a-z]+)\b", text.getvalue())
         by_word = {word.lower(): name for name, word in reversed(meant)}
-        for word in arguments:
-            name = word.partition("=")[0].removeprefix("--").replace("_", "-")
-            if word.startswith("--") and name not in known:
+        for name, word in given.items():
+            if name not in known:
                 nearest = suggest(by_word.get(name, name), known).partition("known: ")[0]
                 hint = nearest.replace("'", "'--", 1)
                 raise NPAError(f"unknown option {word!r}: {hint or 'see --help'}") from end
         print(said.getvalue(), end="", file=sys.stderr)
         raise
     return options
-
-
-def _of_options(message: str, arguments: Sequence[str]) -> str:
-    """Return an error about a dataclass's field with the option that was typed for it."""
-    name = message.partition(" ")[0]
-    for word in arguments:
-        option = word.partition("=")[0]
-        if option.removeprefix("--").replace("-", "_") == name:
-            # Tuples stay as Python writes them.
-            return re.sub(rf"^{name}\b|\b{name}=(?=[\w.-])", f"{option} ", message)
-    return message
 
 
 @dataclass(frozen=True, kw_only=True)
