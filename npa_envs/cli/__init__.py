@@ -10,7 +10,7 @@ import os
 import sys
 from collections.abc import Iterator, Sequence
 
-from npa_envs.errors import NPAError, suggest
+from npa_envs.errors import NPAError, check_known
 
 GROUPS = {
     "make": {
@@ -130,8 +130,7 @@ def _dispatch(arguments: Sequence[str]) -> int:
         print(f"npa-envs {__version__}")
         return 0
     name, rest = arguments[0], arguments[1:]
-    if name not in COMMANDS:
-        raise NPAError(f"unknown command {name!r}: {suggest(name, COMMANDS)}")
+    check_known("unknown command", name, COMMANDS)
     module = importlib.import_module(f"npa_envs.cli.{name.replace('-', '_')}")
     return int(module.main(rest))
 

@@ -20,7 +20,7 @@ import tyro
 from tqdm import tqdm
 
 from npa_envs.atomic_files import NEARLY_FULL_BYTES, made_folder
-from npa_envs.errors import NPAError, suggest
+from npa_envs.errors import NPAError, check_known, suggest
 
 if TYPE_CHECKING:
     import torch
@@ -334,8 +334,7 @@ def chosen_names(noun: str, names: Sequence[str], known: Iterable[str]) -> list[
     """
     known = list(known)
     for name in names:
-        if name not in known:
-            raise NPAError(f"unknown {noun} {name!r}: {suggest(name, known)}")
+        check_known(f"unknown {noun}", name, known)
     return [name for name in known if not names or name in names]
 
 

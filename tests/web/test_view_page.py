@@ -201,6 +201,8 @@ def test_on_a_phone_fingers_brush_and_the_settings_fold(shown):
     page.wait(f"{FRAME}.positions.length < 512")
     click(page, "fold")
     assert page.run("document.getElementById('panel').getBoundingClientRect().width") > 300
+    # The settings leave no room for more than the world.
+    assert page.run("document.querySelector('header').getBoundingClientRect().width") == 0
 
 
 @pytest.mark.slow
