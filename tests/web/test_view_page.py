@@ -206,6 +206,25 @@ def test_on_a_phone_fingers_brush_and_the_settings_fold(shown):
 
 
 @pytest.mark.slow
+def test_the_card_stops_a_training_once(shown):
+    page, _ = shown()
+    before, after, sent = page.run("""(async () => {
+        const { TrainingCard } = await import("./training.js");
+        const sent = [], card = new TrainingCard((message) => sent.push(message));
+        const event = { type: "training", state: "learning", id: "1", name: "a.png", total: 9 };
+        const buttons = () => [...card.card.querySelectorAll("button")];
+        const words = () => buttons().map((button) => button.textContent);
+        card.listen({ ...event, iteration: 1 });
+        const before = words();
+        buttons().find((button) => button.textContent === "Stop").click();
+        card.listen({ ...event, iteration: 2 });
+        return [before, words(), sent];
+    })()""")
+    assert (before, after) == (["×", "Stop"], ["×"])
+    assert sent == [{"type": "training", "action": "stop"}]
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("painter", ["canvas", "webgl2"])
 def test_a_3d_world_turns_under_the_pointer(shown, painter, tmp_path):
     page, _ = shown("duck", 1024, query=f"?painter={painter}")
