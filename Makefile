@@ -41,9 +41,11 @@ $(DEV): $(INPUTS) | $(BIN)/python
 	$(BIN)/python -m pip install --quiet $(PIP_ARGS) -e '.[dev]' -c constraints.txt
 	touch $@ $(CORE)
 
-$(DOCS): $(INPUTS) | $(BIN)/python
-	$(BIN)/python -m pip install --quiet $(PIP_ARGS) -e '.[dev,docs]' -c constraints.txt
-	touch $@ $(DEV) $(CORE)
+# What is installed already stays as it is: only the packages that these extras name are added.
+$(DOCS): $(INPUTS) $(wildcard $(CORE)) | $(BIN)/python
+	$(BIN)/python -m pip show --quiet npa-envs 2>/dev/null || $(MAKE) $(CORE)
+	$(BIN)/python -m pip install --quiet $(PIP_ARGS) 'npa-envs[dev,docs]' -c constraints.txt
+	touch $@
 
 demo: $(CORE)
 	$(BIN)/npa-envs warmup --device cpu
@@ -70,9 +72,10 @@ check: $(DEV)
 	$(BIN)/python -m pip install --quiet --no-deps --no-build-isolation --target $(CHECK)/site $(CHECK)/source
 	cd $(CHECK)/site && ../../../$(BIN)/mypy --config-file ../../../pyproject.toml --cache-dir ../cache -p npa_envs
 
-# The source folder is the root, so that links lead where they lead on a code host.
+# The source folder is the root, so that links lead where they lead on a code host. As a module,
+# Sphinx imports the library from there too, also where another one is installed.
 docs: $(DOCS)
-	$(BIN)/sphinx-build -W --keep-going --quiet -b html -c docs -d build/docs-cache . build/docs
+	$(BIN)/python -m sphinx -W --keep-going --quiet -b html -c docs -d build/docs-cache . build/docs
 
 bench-check: $(CORE)
 	OMP_NUM_THREADS=1 $(BIN)/python benchmarks/alternatives.py --quick --device cpu --check benchmarks/results/ratios.json

@@ -6,7 +6,7 @@ import contextlib
 import difflib
 import math
 import reprlib
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from typing import Any
 
 SHOWN_LENGTH = 200
@@ -108,6 +108,12 @@ def suggest(name: object, known: Iterable[str]) -> str:
     hint = f"did you mean {shown(nearest)}? " if _likeness(name, nearest) >= 0.65 else ""
     more = f" and {len(names) - KNOWN_LENGTH} more" if len(names) > KNOWN_LENGTH else ""
     return f"{hint}known: {', '.join(names[:KNOWN_LENGTH])}{more}"
+
+
+def check_known(begin: str, name: object, known: Collection[str], where: str = "") -> None:
+    """Raise NPAError unless a name is known; its message has `begin`, the name and `where`."""
+    if not isinstance(name, str) or name not in known:
+        raise NPAError(f"{begin} {shown(name)}{where}: {suggest(name, known)}")
 
 
 def _likeness(name: object, known: str) -> float:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from npa_envs.envs.multi.vector import MultiSpeciesVectorEnv
-from npa_envs.errors import NPAError, importing, shown, suggest
+from npa_envs.errors import NPAError, check_known, importing, shown
 from npa_envs.wrappers.base import (
     MAKE_VECTOR,
     AnyVectorEnv,
@@ -375,11 +375,7 @@ class SpeciesVecEnv(RowVecEnv):
                     f"others must be functions of observations, got {type(policy).__name__} for "
                     f"{shown(name)}: RowPolicy(model) makes one of a model"
                 )
-            if name not in env.possible_agents:
-                raise NPAError(
-                    f"others must name species, got {shown(name)}: "
-                    f"{suggest(name, env.possible_agents)}"
-                )
+            check_known("others must name species, got", name, env.possible_agents)
         self.rows_of = [name for name in env.possible_agents if name not in self.others]
         """Species whose particles are rows, in order."""
         if not self.rows_of:
@@ -442,11 +438,7 @@ class SpeciesVecEnv(RowVecEnv):
             species: Name of the species, one of `rows_of`.
             deterministic: Whether it acts by its mean instead of a random action.
         """
-        if species not in self.rows_of:
-            raise NPAError(
-                f"species must be one whose particles are rows, got {shown(species)}: "
-                f"{suggest(species, self.rows_of)}"
-            )
+        check_known("species must be one whose particles are rows, got", species, self.rows_of)
         tag = None
         if self._tags is not None:
             tag = np.eye(len(self.rows_of), dtype=np.float32)[self.rows_of.index(species)]

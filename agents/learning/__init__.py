@@ -22,7 +22,7 @@ import torch
 from npa_envs.agents.learning.problem import EVALUATION_SEEDS, Problem, check_run_seed
 from npa_envs.agents.learning.progress import Budget, CurvePoint, Progress, check_finite
 from npa_envs.agents.learning.rule_set import RuleSet, RuleSetPolicy
-from npa_envs.errors import MissingDependencyError, NPAError, shown, suggest
+from npa_envs.errors import MissingDependencyError, NPAError, check_known, shown, suggest
 from npa_envs.training.process_group import ProcessGroup
 
 __all__ = [
@@ -192,10 +192,7 @@ def _checked_function(
     function = _function(method, methods_for(problem))
     known = _options_of(function)
     for name in options:
-        if name not in known:
-            raise NPAError(
-                f"method {shown(method)} has no option {shown(name)}: {suggest(name, known)}"
-            )
+        check_known(f"method {shown(method)} has no option", name, known)
     return function
 
 

@@ -24,7 +24,7 @@ from npa_envs.agents.search.candidate_evaluation import (
     SearchWorld,
 )
 from npa_envs.checks import is_whole
-from npa_envs.errors import NPAError, importing, shown, suggest
+from npa_envs.errors import NPAError, check_known, importing, shown
 from npa_envs.measure.benchmark_records import installed_version, read_record, write_record
 
 RESULTS = "search.json"
@@ -207,8 +207,7 @@ class Search:
         device: torch.device,
         path: Path | None = None,
     ) -> None:
-        if method not in EMITTERS:
-            raise NPAError(f"unknown method {shown(method)}: {suggest(method, EMITTERS)}")
+        check_known("unknown method", method, EMITTERS)
         for name, value, least in (("seed", seed, 0), ("batch_size", batch_size, 2)):
             if not is_whole(value) or value < least:
                 raise NPAError(

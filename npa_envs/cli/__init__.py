@@ -10,7 +10,7 @@ import os
 import sys
 from collections.abc import Iterator, Sequence
 
-from npa_envs.errors import NPAError, suggest
+from npa_envs.errors import NPAError, check_known
 
 GROUPS = {
     "make": {
@@ -65,6 +65,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     # Read when torch is loaded. On a busy machine, threads that wait in busy loops make every
     # operation several times as slow.
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+    if not sys.stderr.isatty():
+        # Seconds between updates of a bar, each of which a log keeps; read when tqdm is loaded.
+        os.environ.setdefault("TQDM_MININTERVAL", "10")
     # Not by `list`, which is the module of a command.
     words = [*(sys.argv[1:] if arguments is None else arguments)]
     for stream in (sys.stdout, sys.stderr):
@@ -127,8 +130,7 @@ def _dispatch(arguments: Sequence[str]) -> int:
         print(f"npa-envs {__version__}")
         return 0
     name, rest = arguments[0], arguments[1:]
-    if name not in COMMANDS:
-        raise NPAError(f"unknown command {name!r}: {suggest(name, COMMANDS)}")
+    check_known("unknown command", name, COMMANDS)
     module = importlib.import_module(f"npa_envs.cli.{name.replace('-', '_')}")
     return int(module.main(rest))
 

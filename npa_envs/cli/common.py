@@ -9,6 +9,7 @@ import io
 import json
 import math
 import re
+import sys
 import tempfile
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
@@ -19,7 +20,7 @@ import tyro
 from tqdm import tqdm
 
 from npa_envs.atomic_files import NEARLY_FULL_BYTES, made_folder
-from npa_envs.errors import NPAError, suggest
+from npa_envs.errors import NPAError, check_known, suggest
 
 if TYPE_CHECKING:
     import torch
@@ -39,31 +40,49 @@ def parse_options(
 ) -> OptionsT:
     """Parse a command's arguments to the dataclass `cls`; options not given are as in `default`.
 
-    Ends the process after `--help`, and with code 2 for a wrong argument. The help begins with
-    `description`, by default the dataclass's docstring.
+    Ends the process after `--help`, and with code 2 for a wrong argument; raises NPAError for an
+    unknown option and where the dataclass does. The help begins with `description`, by default the
+    dataclass's docstring.
     """
     kwargs: dict[str, Any] = {} if default is None else {"default": default}
     kwargs["config"] = tyro.conf.OmitArgPrefixes, tyro.conf.DisallowNone, tyro.conf.SuppressFixed
     try:
-        options: OptionsT = tyro.cli(
-            cls,
-            prog=f"npa-envs {command}",
-            description=description or inspect.getdoc(cls),
-            args=arguments,
-            **kwargs,
-        )
+        # Kept back: tyro names Python's fields, and suggests an option only for very similar names.
+        with contextlib.redirect_stderr(io.StringIO()) as said:
+            options: OptionsT = tyro.cli(
+                cls,
+                prog=f"npa-envs {command}",
+                description=description or inspect.getdoc(cls),
+                args=arguments,
+                **kwargs,
+            )
     except SystemExit as end:
         if not end.code:
             raise
-        # tyro has said what is wrong, but suggests an option only for very similar names.
+        typed = [word for word in arguments if word.startswith("--")]
+        given = {word[2:].partition("=")[0].replace("_", "-"): word for word in typed}
+        cause: BaseException | None = end
+        while cause is not None and not isinstance(cause, NPAError):
+            cause = cause.__context__
+        if cause is not None:
+            message, field = str(cause), str(cause).partition(" ")[0]
+            if word := given.get(field.replace("_", "-")):
+                # Named as typed; tuples stay as Python writes them.
+                pattern = rf"^{field}\b|\b{field}=(?=[\w.-])"
+                message = re.sub(pattern, f"{word.partition('=')[0]} ", message)
+            raise NPAError(message) from end
         with contextlib.redirect_stdout(io.StringIO()) as text, contextlib.suppress(SystemExit):
             tyro.cli(cls, args=["--help"], **kwargs)
         known = set(re.findall("--([a-z][a-z0-9-]*)", text.getvalue()))
-        for word in arguments:
-            name = word.partition("=")[0].removeprefix("--").replace("_", "-")
-            if word.startswith("--") and name not in known:
-                hint = suggest(name, known).partition("known: ")[0].replace("'", "'--", 1)
+        # Options by the first word of what they are, such as "Steps".
+        meant = re.findall(r"(?ms)^. --([a-z][a-z0-9-]*).*?\b([A-Z][a-z]+)\b", text.getvalue())
+        by_word = {word.lower(): name for name, word in reversed(meant)}
+        for name, word in given.items():
+            if name not in known:
+                nearest = suggest(by_word.get(name, name), known).partition("known: ")[0]
+                hint = nearest.replace("'", "'--", 1)
                 raise NPAError(f"unknown option {word!r}: {hint or 'see --help'}") from end
+        print(said.getvalue(), end="", file=sys.stderr)
         raise
     return options
 
@@ -315,8 +334,7 @@ def chosen_names(noun: str, names: Sequence[str], known: Iterable[str]) -> list[
     """
     known = list(known)
     for name in names:
-        if name not in known:
-            raise NPAError(f"unknown {noun} {name!r}: {suggest(name, known)}")
+        check_known(f"unknown {noun}", name, known)
     return [name for name in known if not names or name in names]
 
 

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 
 from npa_envs.cli import common
-from npa_envs.errors import NPAError, suggest
+from npa_envs.errors import NPAError, check_known
 
 if TYPE_CHECKING:
     from npa_envs.agents.comparison.plan import BudgetKind, ComparisonPlan
@@ -243,11 +243,9 @@ def _method_options(
             raise NPAError(
                 f"options must be METHOD.NAME=VALUE, got {word!r}: evolution.population=64"
             )
-        if method not in methods:
-            raise NPAError(f"unknown method {method!r} in {word!r}: {suggest(method, methods)}")
+        check_known("unknown method", method, methods, f" in {word!r}")
         known = method_options(own.get(method, method))
-        if option not in known:
-            raise NPAError(f"unknown option {option!r} in {word!r}: {suggest(option, known)}")
+        check_known("unknown option", option, known, f" in {word!r}")
         options_of.setdefault(method, {}).update(
             common.named_values("options", [f"{option}={value}"])
         )

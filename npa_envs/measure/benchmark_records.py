@@ -202,7 +202,8 @@ NONE = "–"
 def table_text(rows: Sequence[Any], *, missing: str = "never") -> str:
     """Return rows, instances of one dataclass, as a table in plain text with the fields' names.
 
-    None is shown as `missing`; if that is `UNMEASURED`, columns without values are left out.
+    None is shown as the rows' `missing` if they have one, else as this one; if this one is
+    `UNMEASURED`, columns without values are left out.
     """
     if not rows:
         return ""
@@ -227,6 +228,7 @@ def _cells(rows: Sequence[Any], missing: str) -> list[list[str]]:
     if missing == UNMEASURED:
         names = [name for name in names if any(getattr(row, name) is not None for row in rows)]
     heads = [name.replace("_", " ") for name in names]
+    missing = getattr(rows[0], "missing", missing)
     return [heads, *([_cell(getattr(row, name), missing) for name in names] for row in rows)]
 
 

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from npa_envs.checks import check_device
-from npa_envs.errors import NPAError, shown, suggest
+from npa_envs.errors import NPAError, check_known
 from npa_envs.measure.texture_metric import TextureMetric, TextureRow
 from npa_envs.measure.wounds import WoundRow, wound_rows, wounded
 from npa_envs.rule.files import shipped_rules
@@ -653,8 +653,7 @@ def scores(name: str) -> dict[str, Any]:
     The tables are those of `tables_of`, lists of rows as dicts, by their names.
     """
     rules = shipped_rules()
-    if not isinstance(name, str) or name not in rules:
-        raise NPAError(f"unknown rule {shown(name)}: {suggest(name, rules)}")
+    check_known("unknown rule", name, rules)
     content: dict[str, Any] = json.loads(rules[name].with_suffix(".json").read_text("utf-8"))
     return content
 

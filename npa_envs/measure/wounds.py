@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
@@ -73,21 +73,25 @@ class WoundRow:
     Of `wounds` wounds `changed` raised the loss near them (`LocalLoss`) above its bound. Of these
     `healed` had it within the bound again at both checks. `before`, `after` and `end` are means of
     that loss over the wounds that changed the picture: before them, right after and at the last
-    check; NaN if there are none. `scars` names the parts of the body where wounds did not heal.
+    check; None if there are none. `scars` names the parts of the body where wounds did not heal.
     """
 
     damage: str
     wounds: int
     changed: int
     healed: int
-    before: float
-    after: float
-    end: float
+    before: float | None
+    after: float | None
+    end: float | None
     scars: str = ""
+    missing: ClassVar[str] = "unchanged"
+    """What tables show for None."""
 
     @property
     def summary(self) -> str:
         """What has healed, as text."""
+        if not self.changed:
+            return f"{self.damage}: none of {self.wounds} wounds changed the picture"
         return (
             f"{self.damage}: healed at {self.healed} of {self.changed} places that the wound "
             f"changed; {self.changed} of {self.wounds} wounds changed the picture"
@@ -117,7 +121,8 @@ def wound_rows(
             end = loss(later)
             healed = healed & (end <= loss.bound)
         count = int(changed.sum())
-        first, then, last = (float(each[changed].mean()) for each in (loss.before, after, end))
+        of_changed = (each[changed] for each in (loss.before, after, end))
+        first, then, last = (float(each.mean()) if count else None for each in of_changed)
         name = f"{kind}, {'gap' if kind == 'cut' else 'radius'} {size:g}"
         scars = ", ".join(dict.fromkeys(part_names(worlds.x, centre, changed & ~healed)))
         counts = len(centre), count, int(healed.sum())

@@ -18,7 +18,7 @@ from npa_envs.checks import (
     checked_positive,
     number_tensor,
 )  # fmt: skip
-from npa_envs.errors import NPAError, shown, suggest
+from npa_envs.errors import NPAError, check_known
 from npa_envs.ops import periodic_splat, splat
 from npa_envs.ops.pictures.splat import checked_window
 from npa_envs.render.colours import (
@@ -92,10 +92,7 @@ def draw_worlds(
         Pixels of shape [B, R, R, 3]; the first row is the highest y.
     """
     check_world(x, s)
-    if not isinstance(style, str) or style not in STYLES:
-        raise NPAError(
-            f"style must be one that exists, got {shown(style)}: {suggest(style, STYLES)}"
-        )
+    check_known("style must be one that exists, got", style, STYLES)
     half_width = checked_positive("half_width", half_width)
     periodic = checked_flag("periodic", periodic)
     azimuth = checked_finite("azimuth", azimuth, " [degrees]")

@@ -35,7 +35,7 @@ from torch import Tensor
 
 from npa_envs.atomic_files import check_torch_archive, checked_path, parse_json, write_text
 from npa_envs.checks import check_dense, checked_finite
-from npa_envs.errors import NPAError, shown, suggest
+from npa_envs.errors import NPAError, check_known, shown
 from npa_envs.rule.rule import NPARule, check_rule
 
 _DEMO_SPACE_DIM = 2
@@ -119,7 +119,8 @@ def read_state_dict(data: bytes) -> RuleParts:
     if missing or unknown:
         raise NPAError(
             f"the state dict{rule_type} must hold {sorted(required)}{more}; missing: "
-            f"{sorted(missing)}, unknown: {shown(sorted(map(str, unknown)))}"
+            f"{sorted(missing)}, unknown: {shown(sorted(map(str, unknown)))}: a file of another "
+            "model holds no rule; give the npa.pth of the authors' training, or a run's folder"
         )
     weights = {known[name]: _matrix(name, state[name]) for name in known if name in state}
     if known is _EQUIVARIANT_NAMES:
@@ -248,8 +249,7 @@ def _demo_rule(content: Any, name: str | None) -> tuple[Mapping[str, Any], int |
             f"the file holds several rules: add #name; names: {shown(', '.join(rules))[1:-1]}"
         )
     name = next(iter(rules)) if name is None else name
-    if name not in rules:
-        raise NPAError(f"the file holds no rule {shown(name)}: {suggest(name, rules)}")
+    check_known("the file holds no rule", name, rules)
     return rules[name]
 
 

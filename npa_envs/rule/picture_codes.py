@@ -11,7 +11,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from npa_envs.errors import NPAError, shown, suggest
+from npa_envs.errors import NPAError, check_known, shown
 
 MAX_CODE_COUNT = 65536
 """Largest number of codes of a rule."""
@@ -51,8 +51,7 @@ class Codes(nn.Module):
 
     def __getitem__(self, name: str) -> Tensor:
         """Return the code of the picture called `name`, shape [code_dim]."""
-        if name not in self.names:
-            raise NPAError(f"unknown code {shown(name)}: {suggest(name, self.names)}")
+        check_known("unknown code", name, self.names)
         return self.table[self.names.index(name)]
 
     def blend(self, shares: Mapping[str, float]) -> Tensor:

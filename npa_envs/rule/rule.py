@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import functools
 import math
-from collections.abc import Sequence
-from typing import Any, get_args, get_type_hints
+from collections.abc import Callable, Sequence
+from typing import Any, ParamSpec, get_args, get_type_hints
 
 import torch
 from torch import Tensor, nn
@@ -20,7 +21,7 @@ from npa_envs.checks import (
     constant,
     is_whole,
 )
-from npa_envs.errors import NPAError, shown
+from npa_envs.errors import NPAError, UnknownKeywordError, shown, suggest
 from npa_envs.ops.equivariance import MIXED_VECTORS, VectorSizes, invariants, signed_gates, steered
 from npa_envs.ops.physics import Terms
 from npa_envs.rule.folded_network import (
@@ -54,6 +55,22 @@ STEP_PARTS = frozenset([
     "network_weights", "output_dim", "perception_dim", "update_dim", "update_weight", "vector_form",
 ])  # fmt: skip
 """Attributes that a step uses: a subclass that overrides one of them is not plain."""
+
+
+P = ParamSpec("P")
+
+
+def _naming_keywords(initialise: Callable[P, None]) -> Callable[P, None]:
+    """Return an `__init__` whose error about an unknown keyword names the nearest one."""
+
+    @functools.wraps(initialise)
+    def checked(*args: P.args, **keywords: P.kwargs) -> None:
+        for name in sorted(keywords.keys() - HYPER_PARAMETERS.keys()):
+            hint = suggest(name, HYPER_PARAMETERS)
+            raise UnknownKeywordError(f"got an unexpected keyword argument {name!r}: {hint}")
+        initialise(*args, **keywords)
+
+    return checked
 
 
 class NPARule(nn.Module):
@@ -107,10 +124,11 @@ class NPARule(nn.Module):
         encoder: A network computes codes from pictures (`codes.encode`).
 
     Raises:
-        NPAError: A dimension or a length is out of range, `moment_inverse` is unknown, or arguments
-            exclude each other.
+        NPAError: A dimension or a length is out of range, `moment_inverse` or a keyword is unknown,
+            or arguments exclude each other.
     """
 
+    @_naming_keywords
     def __init__(
         self,
         space_dim: int = 2,

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from npa_envs.checks import check_positive, check_world, checked_number
-from npa_envs.errors import NPAError, shown, suggest
+from npa_envs.errors import NPAError, check_known, shown
 from npa_envs.ops import world_mean
 from npa_envs.tasks.seeds import drawn_indices, uniform_ball
 from npa_envs.world.brushes import Sides, clump, cut, wipe_state
@@ -31,8 +31,7 @@ CLUMP_FACTOR = 0.9
 
 def check_damage(kind: object, where: str = "") -> None:
     """Raise NPAError unless `kind` is in `DAMAGE_SIZES`; its message says `where` it stood."""
-    if not isinstance(kind, str) or kind not in DAMAGE_SIZES:
-        raise NPAError(f"unknown damage {shown(kind)}{where}: {suggest(kind, DAMAGE_SIZES)}")
+    check_known("unknown damage", kind, DAMAGE_SIZES, where)
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ from typing import Any, TypeVar
 import torch
 
 from npa_envs.atomic_files import checked_path, parse_json, read_bytes
-from npa_envs.errors import NPAError, shown, suggest
+from npa_envs.errors import NPAError, check_known, shown, suggest
 from npa_envs.tasks.base import Task
 from npa_envs.tasks.co_morphogenesis2d import CO_MORPHOGENESIS2D_PRESETS, CoMorphogenesis2D
 from npa_envs.tasks.many_pictures import ManyPictures
@@ -133,8 +133,7 @@ TASKS: Mapping[str, TaskEntry] = {
 
 def task_entry(task_name: str) -> TaskEntry:
     """Return the entry of a task in `TASKS`; raises NPAError if there is no such task."""
-    if not isinstance(task_name, str) or task_name not in TASKS:
-        raise NPAError(f"unknown task {shown(task_name)}: {suggest(task_name, TASKS)}")
+    check_known("unknown task", task_name, TASKS)
     return TASKS[task_name]
 
 
@@ -150,8 +149,7 @@ def preset(name: str, task_name: str = "morphogenesis2d", /, **fields: Any) -> T
         NPAError: The task, the preset or a field is unknown, or a value is not allowed.
     """
     presets = task_entry(task_name).presets
-    if not isinstance(name, str) or name not in presets:
-        raise NPAError(f"unknown preset {shown(name)} of {task_name}: {suggest(name, presets)}")
+    check_known("unknown preset", name, presets, f" of {task_name}")
     return override(presets[name], **fields)
 
 
@@ -180,8 +178,7 @@ def override(config: TrainConfig[TaskConfigT], /, **fields: Any) -> TrainConfig[
     run_types, task_types = _field_types(config), _field_types(config.task)
     known = [*run_types, *task_types]
     for name in fields:
-        if name not in known:
-            raise NPAError(f"unknown field {shown(name)}: {suggest(name, known)}")
+        check_known("unknown field", name, known)
     run_fields = {name: value for name, value in fields.items() if name in run_types}
     task_fields = {name: value for name, value in fields.items() if name not in run_types}
     task: Any = run_fields.pop("task", config.task)
@@ -241,8 +238,7 @@ def load_config(
     fields = dict(fields)
     try:
         if presets is not None and (name := fields.pop("preset", None)) is not None:
-            if not isinstance(name, str) or name not in presets:
-                raise NPAError(f"unknown preset {name!r}: {suggest(name, presets)}")
+            check_known("unknown preset", name, presets)
             base = presets[name]
         return override(base, **fields)
     except NPAError as error:

@@ -97,9 +97,14 @@ class EnvironmentWorld(LiveWorld):
             "dimension": self._physics.space_dim,
             "half_width": task.half_width if self.box is None else 0.5 * min(self.box),
             "spot": 0.7 * float(task.pixel_size),
+            "class_count": int(getattr(task.config, "class_count", 0)),
             "damages": list(DAMAGE_SIZES) if self._physics.moving else ["wipe"],
             "capabilities": ["film", "loss"],
         }
+        if event["class_count"]:
+            # Clouds fill [0, 1]², and the environment's sizes are those of its magnified pictures.
+            frame, spot = task.task.frame, 0.7 * task.task.pixel_size
+            event |= {"centre": [*frame.centre], "half_width": frame.half_width, "spot": spot}
         return event
 
     def _allowed(self) -> set[str]:

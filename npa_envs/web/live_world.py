@@ -12,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from npa_envs.errors import NPAError, shown, suggest
+from npa_envs.errors import NPAError, check_known, shown, suggest
 from npa_envs.ops import species_fields
 from npa_envs.render.colours import GOLDEN_ANGLE, STATE_CHROMA, STATE_GAIN, ramp, srgb
 from npa_envs.tasks.damage import check_damage, damage_worlds
@@ -177,8 +177,7 @@ class LiveWorld(ABC):
         ranges = self._ranges()
         match name:
             case "show":
-                if value not in self._shows():
-                    raise NPAError(f"unknown show {shown(value)}: {suggest(value, self._shows())}")
+                check_known("unknown show", value, self._shows())
                 self.show = str(value)
             case "loss":
                 self._loss_wanted = bool(value)

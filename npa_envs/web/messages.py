@@ -64,6 +64,7 @@ class WorldEvent(TypedDict, total=False):
     species: list[str]  # Rules of the world's particles.
     shows: list[str]  # Values of the setting "show".
     show: str  # What colours show: a name of `shows_of` of live_world.py.
+    class_count: int  # Classes of which the particles' own colours name one; 0: these are others.
     tools: list[dict[str, Any]]  # The world's brushes: `name`, and the fields of `Brush`.
     damages: list[str]  # Kinds of damage, as the page's buttons name them.
     settings: dict[str, dict[str, Any]]  # By name: `value`, and the fields of `Range`.

@@ -12,7 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from npa_envs.errors import NPAError, shown, suggest
+from npa_envs.errors import NPAError, check_known, shown
 from npa_envs.rule.files import load_rule, rule_metadata, rule_name, shipped_rules
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.base import Task
@@ -90,8 +90,7 @@ class RuleWorld(LiveWorld):
         self._choose_rule(name, particle_count)
 
     def _live_rule(self, name: Any) -> LiveRule:
-        if not isinstance(name, str) or name not in self._choices:
-            raise NPAError(f"unknown rule {shown(name)}: {suggest(name, self._choices)}")
+        check_known("unknown rule", name, self._choices)
         if name not in self._rules:
             rule = load_rule(self._choices[name], device=self._device).float()
             self._rules[name] = rule.requires_grad_(False)
@@ -160,6 +159,7 @@ class RuleWorld(LiveWorld):
             "rule": self.main.name,
             "others": [name for name in self._choices if self._may_join(name)],
             "species": [live_rule.name for live_rule in self.live_rules],
+            "class_count": int(getattr(self.task.config, "class_count", 0)),
             "damages": list(DAMAGE_SIZES),
             "capabilities": ["film", *([] if self.trained.why_not_measurable else ["loss"])],
         }

@@ -126,6 +126,7 @@ WIDE = NPARule(state_dim=2)
         (lambda: perceive(X, S, 0.1, 0.0), "eps0 must be positive"),
         (lambda: species_fields(X, torch.tensor(4), eps=0.1), "counts must have one number"),
         (lambda: rollout_species(np.array(1.0), X, S, 1, counts=[4]), "rules must"),
+        (rule(state_dims=8), "keyword argument .state_dims.: did you mean .state_dim.\\?"),
         (rule(state_dim=0), "state_dim must be a whole number of at least 1"),
         (rule(alpha=INF), "alpha"),
         (rule(alpha=[]), "alpha must be a number"),

@@ -51,6 +51,13 @@ def test_an_environment_gets_the_keywords_that_a_rule_needs():
         make("npa/Texture-v0", policy="dots")
 
 
+def test_the_clouds_of_an_environment_are_in_the_middle_and_their_classes_are_counted():
+    pytest.importorskip("sklearn")
+    world = make("npa/PointClassification-v0").describe()
+    assert (world["class_count"], world["centre"], world["half_width"]) == (10, [0.5, 0.5], 0.6)
+    assert make("npa/Texture-v0").describe()["class_count"] == 0
+
+
 def test_environments_of_ones_own_are_viewed(tmp_path, monkeypatch):
     text = "gymnasium.register('own/Spots-v0', 'npa_envs.envs.texture:TextureEnv')"
     (tmp_path / "own_envs.py").write_text(f"import gymnasium\n{text}\n", encoding="utf-8")

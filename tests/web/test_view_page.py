@@ -199,6 +199,27 @@ def test_on_a_phone_fingers_brush_and_the_settings_fold(shown):
     page.wait(f"{FRAME}.positions.length < 512")
     click(page, "fold")
     assert page.run("document.getElementById('panel').getBoundingClientRect().width") > 300
+    # The settings leave no room for more than the world.
+    assert page.run("document.querySelector('header').getBoundingClientRect().width") == 0
+
+
+@pytest.mark.slow
+def test_the_card_stops_a_training_once(shown):
+    page, _ = shown()
+    before, after, sent = page.run("""(async () => {
+        const { TrainingCard } = await import("./training.js");
+        const sent = [], card = new TrainingCard((message) => sent.push(message));
+        const event = { type: "training", state: "learning", id: "1", name: "a.png", total: 9 };
+        const buttons = () => [...card.card.querySelectorAll("button")];
+        const words = () => buttons().map((button) => button.textContent);
+        card.listen({ ...event, iteration: 1 });
+        const before = words();
+        buttons().find((button) => button.textContent === "Stop").click();
+        card.listen({ ...event, iteration: 2 });
+        return [before, words(), sent];
+    })()""")
+    assert (before, after) == (["×", "Stop"], ["×"])
+    assert sent == [{"type": "training", "action": "stop"}]
 
 
 @pytest.mark.slow

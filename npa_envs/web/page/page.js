@@ -7,8 +7,8 @@ import { Plot, make, short } from "./plots.js";
 // What missing fields of the event "world" count as.
 const BLANK = {
   title: "npa-envs", note: "", dimension: 2, box: null, half_width: 1.1, spot: 0.015, rules: [], rule: null,
-  centre: [0, 0, 0], others: [], species: [], shows: ["colours"], show: "colours", tools: [], damages: [], settings: {},
-  capabilities: [], playing: true, seed: 0,
+  centre: [0, 0, 0], others: [], species: [], shows: ["colours"], show: "colours", class_count: 0, tools: [],
+  damages: [], settings: {}, capabilities: [], playing: true, seed: 0,
 };
 
 // The page's own brush, before those of the world: it sends no messages.
@@ -16,9 +16,7 @@ const LOOK = { name: "look", label: "Look: drag to move or turn, wheel or pinch 
 
 // What colours mean, by the names of `shows_of` of live_world.py, those of state channels without their number.
 const MEANINGS = {
-  colours: "The particles' own colours: the picture, or the class that each names.",
-  digits: "Which digit each particle takes this for: 0 red, 1 green, 2 yellow, 3 blue, 4 orange, 5 purple, 6 cyan, " +
-    "7 pink, 8 brown, 9 black; grey where it is not sure.",
+  colours: "The particles' own colours, which make the picture.",
   density: "How crowded it is around a particle, from dark to bright.",
   components: "The three directions in which states differ most, as red, green and blue: like colour, like state.",
   species: "Which rule a particle follows.",
@@ -26,6 +24,9 @@ const MEANINGS = {
   mask: "Which particles the last step updated (yellow): each with probability p.",
   state: "One channel of the states: blue below zero, grey at zero, orange above.",
 };
+
+// Colours of classes, those of PALETTE of npa_envs/tasks/point_classification.py, repeated for more.
+const CLASSES = ["red", "green", "yellow", "blue", "orange", "purple", "cyan", "pink", "brown", "black"];
 
 // SVG paths on a square of side 24, by the names of brushes and controls.
 const ICONS = {
@@ -432,8 +433,10 @@ class Controls {
       ? $("other").value : world.others.find((name) => name !== world.rule);
     options($("other"), world.others, other);
     options($("show"), world.shows, world.show);
-    const classes = world.show === "colours" && world.rule === "digits";
-    $("meaning").textContent = MEANINGS[classes ? "digits" : world.show.split(" ")[0]];
+    const classes = Array.from({ length: world.class_count }, (_, k) => `${k} ${CLASSES[k % CLASSES.length]}`);
+    $("meaning").textContent = world.show === "colours" && classes.length
+      ? `Which class each particle takes this for: ${classes.join(", ")}; grey where it is not sure.`
+      : MEANINGS[world.show.split(" ")[0]];
     $("rule-field").hidden = world.rules.length < 2;
     $("other-field").hidden = !world.tools.some(({ takes }) => takes === "rule");
     $("brush").hidden = !world.tools.length;

@@ -13,7 +13,7 @@ export class TrainingCard {
     this.send = send;
     this.event = null; // the last event "training"
     this.psnr = null; // of the world that is shown [dB]
-    this.upload = null; // what was uploaded last, for another try
+    this.upload = null; // what the server took last, for another try
     this.showing = ""; // the id of the training whose world is shown
     this.stopping = ""; // the id of the training that the user has stopped
     this.open = false;
@@ -60,7 +60,7 @@ export class TrainingCard {
   // Uploads a file, or an emoji as text. `options` are keywords of the server's `upload`.
   async take(content, options = {}) {
     const name = content.name ?? content;
-    Object.assign(this, { upload: content, open: true, choosing: false, refusal: "", busy: false });
+    Object.assign(this, { open: true, choosing: false, refusal: "", busy: false });
     if (typeof content === "string") options.emoji = "1";
     try {
       const mib = (size) => Math.ceil(size / 2 ** 20), { limit } = this.event;
@@ -70,7 +70,7 @@ export class TrainingCard {
       this.busy = answer.status === 409;
       if (!answer.ok) throw Error(await answer.text());
       sessionStorage.setItem(MINE, (await answer.json()).id);
-      this.psnr = null;
+      Object.assign(this, { upload: content, psnr: null });
     } catch (error) {
       this.refusal = error.message;
     }
@@ -148,14 +148,14 @@ export class TrainingCard {
       reading: "Reading the file…", starting: "Starting the training…",
       learning: `Iteration ${iteration} of ${total}${left === undefined ? "" : `, ${duration(left)} left`}`,
     };
-    const stop = () => {
+    const stopping = this.stopping === id, stop = button("Stop", () => {
       this.send({ type: "training", action: "stop" });
       this.change({ stopping: id });
-    };
+    });
     return [
       this.heading(`Learning ${name}`), bar,
-      text(this.stopping === id ? "Stopping; what it has learned is saved…" : words[state]), text(note),
-      row(this.quality(), ...(has_rule && this.showing !== id ? [this.watch()] : []), button("Stop", stop)),
+      text(stopping ? "Stopping; what it has learned is saved…" : words[state]), text(note),
+      row(this.quality(), ...(has_rule && this.showing !== id ? [this.watch()] : []), ...(stopping ? [] : [stop])),
     ];
   }
 
@@ -199,7 +199,7 @@ export class TrainingCard {
     if (!problem) return [];
     const line = make("p", { className: "problem", textContent: problem });
     line.setAttribute("role", "alert");
-    const cured = !this.refusal && this.event.cure === "whole" && upload;
+    const cured = problem !== this.refusal && this.event.cure === "whole" && upload;
     return cured ? [line, row(button("Grow the whole picture", () => this.take(upload, { whole: "1" })))] : [line];
   }
 }
