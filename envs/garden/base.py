@@ -211,9 +211,10 @@ class GardenEnv(NPAEnv):
 
     ## Action space
 
-    With `actions="grid"`, `Box(-1, 1, (P², W), float32)`: a row for the brush at each place of the
-    grid. All brushes act at once, their effects add up, and then the rule makes `rule_steps` steps.
-    Zeros have no effect.
+    With `actions="grid"`, `Box(-1, 1, (P² W,), float32)`: a row of W columns for the brush at each
+    place of the grid, row after row. With `action_shape="brushes"` the shape is [P², W]; `step`
+    takes both, whatever `action_shape` is. All brushes act at once, their effects add up, and then
+    the rule makes `rule_steps` steps. Zeros have no effect.
 
     | Columns | Action a | An action of 1 is | Effect at the brush's weight w |
     |---|---|---|---|
@@ -229,8 +230,8 @@ class GardenEnv(NPAEnv):
     is differentiable, except that the moment correction of
     [perception](../mathematics.md#perception) counts as constant.
 
-    With `actions="free"`, `Box(-1, 1, (J, 2 + W), float32)`: there are J = `brush_count` brushes,
-    and the first two columns are the position of each, along x and y [length units].
+    With `actions="free"` there are J = `brush_count` brushes of 2 + W columns each, J (2 + W)
+    numbers. The first two columns are a brush's position, along x and y [length units].
 
     With `actions="discrete"`, `MultiDiscrete` with four choices for each of J brushes: its place on
     the grid along x and along y; its tool (nothing, a push in one of eight directions, wipe, each
@@ -251,4 +252,9 @@ class GardenEnv(NPAEnv):
 
     As in [every environment](Morphogenesis2D.md#vectorized-environment), but on a CPU worlds are
     stepped one by one: a batch saves no time there.
+
+    ## Version history
+
+    - v0: first version. Actions of preliminary versions were rows, as with
+      `action_shape="brushes"`; worlds, rewards and returns are the same.
     """

@@ -24,7 +24,7 @@ TOOLS = {"tools": ("push", "wipe", "inject", "rate")}
 FORMS = {
     "grid": TOOLS,
     "discrete": TOOLS | {"actions": "discrete", "observe": "picture"},
-    "free": {"actions": "free", "brush_count": 3, "observe": "moments"},
+    "free": {"actions": "free", "action_shape": "brushes", "brush_count": 3, "observe": "moments"},
 }
 CASES = {name: (name, {}) for name in IDS}
 CASES["pictures-seen"] = (PICTURES, {"observe_target": True})

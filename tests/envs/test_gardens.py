@@ -9,9 +9,10 @@ import pytest
 import torch
 from pettingzoo.test import api_test, parallel_api_test, parallel_seed_test
 from support.refusals import refused
-from support.small_envs import begun, make, make_vec, small
+from support.small_envs import assert_same, begun, make, make_vec, small
 
 import npa_envs
+from npa_envs.agents.garden_policies import RandomGardener
 from npa_envs.agents.shapeshifter_policies import RecognisingShapeshifter
 from npa_envs.envs import gardeners_v0
 from npa_envs.envs.garden.base import StartLosses
@@ -77,6 +78,25 @@ def test_brushes_stand_on_the_grid_and_what_they_do_adds_up():
     assert torch.allclose(moved - x, 0.15 * held[None, :, None] * everywhere[0, 0], atol=1e-6)
 
 
+@pytest.mark.parametrize("form", [{}, {"actions": "free", "brush_count": 3}])
+@pytest.mark.parametrize("name", [GARDENER, SHEPHERD])
+def test_actions_are_flat_or_rows_of_brushes_and_every_step_takes_both(name, form):
+    many = {"action_shape": "brushes"} | form
+    alone = [make(name, **form), make(name, **many)]
+    batches = [make_vec(name, 2, **form), make_vec(name, 2, **many)]
+    rows = alone[1].action_space.shape
+    assert alone[0].action_space.shape == (rows[0] * rows[1],)
+    for envs, count in ((alone, ()), (batches, (2,))):
+        action = np.random.default_rng(0).uniform(-1.0, 1.0, (*count, *rows)).astype(np.float32)
+        given = action, action.reshape(*count, -1)
+        results = [begun(env, seed=1).step(one) for env in envs for one in given]
+        for result in results[1:]:
+            assert_same(results[0], result)
+        for env in envs:
+            acts = RandomGardener(env)(env.reset(seed=0)[0])
+            assert env.action_space.contains(acts)
+
+
 def test_what_lacks_is_seen_where_it_lacks():
     env = begun(make(GARDENER, particle_count=256, eps=0.1, resolution=32))
     task, target = env.unwrapped.task, env.unwrapped.task.task.target
@@ -132,7 +152,7 @@ def test_a_world_that_is_stopped_stays_as_it_is():
     env.step(action)
     assert not torch.equal(env.unwrapped.particles()[0], x)
     env.unwrapped.place_particles(x, s)
-    action[0, -1] = -1.0
+    action[-1] = -1.0
     _, reward, *_ = env.step(action)
     assert torch.allclose(env.unwrapped.particles()[0], x, atol=1e-5)
     assert torch.allclose(env.unwrapped.particles()[1], s, atol=1e-5)
@@ -165,7 +185,7 @@ def test_the_whole_world_is_differentiable_by_every_number_of_a_brush():
     (slope,) = torch.autograd.grad(worth(given), given)
     columns = BrushLayout.for_config(env.config)
     for column in range(columns.width):
-        assert float(slope[0, :, column].abs().sum()) > 0.0, column
+        assert float(slope[0, column :: columns.width].abs().sum()) > 0.0, column
     way = torch.rand(shape, generator=generator, dtype=torch.float64) - 0.5
     step = 1e-6
     difference = (worth(action + step * way) - worth(action - step * way)) / (2.0 * step)
