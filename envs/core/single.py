@@ -157,8 +157,7 @@ class NPAEnv(WorldsEnv, gymnasium.Env[Any, Any]):
             DivergedError: The action is not finite, and the world is not changed; or the world
                 diverged, and `on_divergence` is "raise".
         """
-        if not self._started:
-            raise NPAError("step needs a world: call reset first")
+        self.check_begun("step needs a world")
         worlds = self.worlds
         checked = self.spaces.action(action, None)
         with worlds.device_context():
@@ -186,8 +185,7 @@ class NPAEnv(WorldsEnv, gymnasium.Env[Any, Any]):
 
         Positions, [N, D], and states, [N, C], must be finite and within their limits.
         """
-        if not self._started:
-            raise NPAError("particles need a world: call reset first")
+        self.check_begun("particles need a world")
         x, s = number_tensor("x", x)[None], number_tensor("s", s)[None]
         placed = self.worlds.checked_particles(x, s, 1, self.config.particle_count)
         observation = self._change_worlds(self.worlds.place, self._world_index, placed)

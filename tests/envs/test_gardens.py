@@ -18,6 +18,7 @@ from npa_envs.envs import gardeners_v0
 from npa_envs.envs.garden.base import StartLosses
 from npa_envs.envs.garden.brush_actions import BrushLayout, apply_brushes, grid_places
 from npa_envs.envs.gardener2d import Gardener2DEnv
+from npa_envs.envs.multi import AGENT_REASONS
 from npa_envs.registration import GARDENS
 from npa_envs.world.particles import Particles
 
@@ -323,6 +324,25 @@ def test_what_one_earns_the_other_loses_until_the_time_limit():
         assert set(late.values()) == {step == 2}
     assert env.agents == []
     refused("actions must be given for the agents", env.step, actions)
+
+
+def test_two_gardeners_have_a_state_a_generator_and_the_same_numbers_in_all_infos():
+    env = gardeners_v0.parallel_env(max_cycles=2, **GARDEN)
+    refused("state needs a world: call reset first", env.state)
+    _, infos = env.reset(seed=3)
+    assert env.np_random.bit_generator.state == begun(env, seed=3).np_random.bit_generator.state
+    names, reasons = set(infos["keeper_0"]), []
+    while env.agents:
+        x, s = env.garden.particles()
+        assert np.array_equal(env.state(), torch.cat((x, s, torch.ones(61, 1)), dim=1))
+        assert env.state_space.contains(env.state())
+        *_, infos = env.step({agent: env.action_space(agent).sample() for agent in env.agents})
+        assert set(infos["keeper_0"]) == set(infos["raider_0"]) == names
+        assert all(isinstance(value, int | float) for value in infos["keeper_0"].values())
+        reasons.append(AGENT_REASONS[infos["keeper_0"]["reason"]])
+    assert reasons == [None, "time limit"]
+    env.close()
+    refused("step needs a world, which close has ended", env.step, {})
 
 
 def test_brushes_of_both_add_up_and_without_a_raider_it_is_the_gardeners_world():
