@@ -93,10 +93,11 @@ class NPAEnv(WorldsEnv, gymnasium.Env[Any, Any]):
 
     - With `output="torch"` results are tensors on the device, and actions may be too. Only the
       flags of episode ends are copied to the host.
-    - Infos are arrays of shape [B] with masks, as Gymnasium's vector environments have them.
+    - Infos are those of Gymnasium's `SyncVectorEnv`, arrays of shape [B] with masks. As tensors they
+      are of all worlds, and the masks say which count.
     - With `autoreset_mode="same-step"`, the default, a world whose episode is over starts the next
-      one at once: the last observation is in `infos["final_obs"]`, the last infos in
-      `infos["final_info"]`.
+      one at once: the last observation is in `infos["final_obs"]`, an object array with None for
+      other worlds, or a tensor of all worlds; the last infos are in `infos["final_info"]`.
     - `reset(options={"reset_mask": mask})` resets some worlds and does not change the others.
 
     `env.unwrapped.particles()` returns positions and states, and `place_particles(x, s)` replaces
