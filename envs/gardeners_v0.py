@@ -104,7 +104,8 @@ class GardenersEnv(KnownAgents):
         self.agents: list[str] = []
         self.observation_spaces = dict.fromkeys(AGENTS, self.garden.observation_space)
         self.action_spaces = dict.fromkeys(AGENTS, self.garden.action_space)
-        self.state_space = state_space(self.garden.worlds.physics, self.garden.config.particle_count)
+        worlds = self.garden.worlds
+        self.state_space = state_space(worlds.physics, worlds.x.shape[1])
         """Space of `state`: float32, shape [N, 2 + C + 1]."""
 
     @property

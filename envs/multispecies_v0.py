@@ -70,9 +70,9 @@ class MultiSpeciesEnv(CrowdEnv):
     ## Action space
 
     `Box(-1, 1, (N_k, A), float32)` with A = 2 + C, for species k. The columns, and what they do,
-    are those of [`npa/Morphogenesis2D-v0`](Morphogenesis2D.md#action-space). Every live agent, see
-    `agents`, has to give an action; those of agents that ended are ignored. A wrong action, or one that is not
-    finite, raises `NPAError` and does not change the world.
+    are those of [`npa/Morphogenesis2D-v0`](Morphogenesis2D.md#action-space). Every agent in
+    `agents` has to give an action; those of agents that ended are ignored. A wrong action, or one
+    that is not finite, raises `NPAError` and does not change the world.
 
     ## Reward
 

@@ -28,8 +28,9 @@ class NPATorchRLEnv(EnvBase):  # type: ignore[misc]
 
     Entries are `observation` [B, N, P], `action` [B, N, A], and `reward`, `done`, `terminated` and
     `truncated`, [B, 1] each. Where observations are dictionaries, as in `npa/Shepherd2D-v0`, their
-    entries stand in the place of `observation`. TorchRL restarts worlds itself, each when its own episode is over.
-    World k, seeded with s, has the episodes of the single environment seeded with s + k.
+    entries stand in the place of `observation`. TorchRL restarts worlds itself, each when its own
+    episode is over. World k, seeded with s, has the episodes of the single environment seeded with
+    s + k.
 
     With `rows=True` every particle is an element of the batch, so TorchRL's losses for one agent
     train one small policy that all particles share. `observation` and `action` keep their shapes,

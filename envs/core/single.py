@@ -15,7 +15,6 @@ from npa_envs.envs.core.base import WorldsEnv
 from npa_envs.envs.core.config import as_python
 from npa_envs.envs.core.step_report import reason
 from npa_envs.envs.core.vector import check_options, rng_keys
-from npa_envs.errors import NPAError
 from npa_envs.world.environment_steps import DIVERGED, SUCCESS, TIME_LIMIT
 
 
@@ -93,8 +92,8 @@ class NPAEnv(WorldsEnv, gymnasium.Env[Any, Any]):
 
     - With `output="torch"` results are tensors on the device, and actions may be too. Only the
       flags of episode ends are copied to the host.
-    - Infos are those of Gymnasium's `SyncVectorEnv`, arrays of shape [B] with masks. As tensors they
-      are of all worlds, and the masks say which count.
+    - Infos are those of Gymnasium's `SyncVectorEnv`: arrays of shape [B] with masks. As tensors
+      they are of all worlds, and the masks say which count.
     - With `autoreset_mode="same-step"`, the default, a world whose episode is over starts the next
       one at once: the last observation is in `infos["final_obs"]`, an object array with None for
       other worlds, or a tensor of all worlds; the last infos are in `infos["final_info"]`.

@@ -65,7 +65,9 @@ class CrowdEnv(AgentsEnv, KnownAgents):
         """Start an episode as `NPAEnv.reset` does; return all agents' observations and infos."""
         observation = self._start(np.arange(1), seed, seed)
         self._update_agents()
-        return self._by_agent(observation), self._infos(self.worlds.agent_returns.loss_infos(stepped=True))
+        # Nothing has been gained so far.
+        numbers = self.worlds.agent_returns.loss_infos(stepped=True)
+        return self._by_agent(observation), self._infos(numbers)
 
     def step(self, actions: Mapping[str, Any]) -> Outcome:
         """Apply an action of each live agent; return an `Outcome` for these agents.
