@@ -18,19 +18,20 @@ import numpy as np
 HERE = Path(__file__).resolve().parent
 ROOT = HERE.parents[1]
 
-AGENTS = r"(gardeners|species/\w+/(parallel|particles))"
+AGENTS = r"(gardeners|species/\w+/(parallel|particles))/steps"
+BATCH_INFOS = "infos of batches are those of SyncVectorEnv"
 ACCEPTED = {
     "film/gecko/growth-filmstrip.png": "its caption says wipe for erase",
     "healing/heart/healing": "healing is measured near wounds",
     "golden/batch-": "gone: other tests compare batches with single environments",
     "golden/crowd-in-turn": "gone: another test compares turns with acting at once",
     "gardeners/state$": "two gardeners had no state",
-    f"{AGENTS}/steps/(0/1/.*/(reward_.*|success|diverged)|./[14]/.*/reason)$": "infos of agents are "
-    "numbers of the same names at all times",
-    "batch/.*/steps/4/4/_?(success|diverged|reward_.*)$": "infos of batches are those of SyncVectorEnv",
-    "batch/.*/(accuracy|distance|lost)$": "infos of batches are those of SyncVectorEnv",
+    f"{AGENTS}/0/1/.*/(reward_.*|success|diverged)$": "infos have the same names at all times",
+    f"{AGENTS}/./[14]/.*/reason$": "infos of agents are numbers",
+    "batch/.*/steps/4/4/_?(success|diverged|reward_.*)$": BATCH_INFOS,
+    "batch/.*/(accuracy|distance|lost)$": BATCH_INFOS,
 }
-"""Beginnings of names of arrays that may differ, or be there on one side alone, and why: patterns."""
+"""Patterns, which names of arrays begin with that may differ or be on one side alone, and why."""
 
 
 def start(tree, folder, only):
