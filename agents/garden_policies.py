@@ -1,6 +1,7 @@
 """Gardeners and shepherds: policies that use brushes; random, scripted, or planned by gradients.
 
-Actions of B worlds have shape [B, J, W]: J brushes, W columns each.
+`act` returns rows of brushes, [B, J, W]: J brushes, W columns each. A policy returns them in the
+shape of the environment's action space.
 """
 
 from __future__ import annotations
@@ -38,16 +39,18 @@ class BrushPolicy:
         self.config = self.task.config
         self.columns = BrushLayout.for_config(self.config)
         self.shape = inner.spaces.rows_shape
-        """Shape of a world's actions, (J, W)."""
+        """Shape of a world's rows of brushes, (J, W)."""
+        self._action_shape = inner.spaces.action_shape
 
     def __call__(self, observation: Any) -> Any:
-        """Return actions, [J, W] for one world's observation of shape [O], [B, J, W] for [B, O].
+        """Return actions of the environment's shape, of B worlds for observations [B, O].
 
-        J brushes have W columns each. Of the observation only the form counts: worlds are read.
+        For one world's observation, [O], they are its own, without a dimension of worlds. Of the
+        observation only the form counts: worlds are read.
         """
         array = observation["observation"] if isinstance(observation, dict) else observation
-        one_world = array.ndim == 1
-        actions = self.act()[0] if one_world else self.act()
+        actions = self.act().reshape(-1, *self._action_shape)
+        actions = actions[0] if array.ndim == 1 else actions
         return actions if isinstance(array, Tensor) else actions.cpu().numpy()
 
     def act(self) -> Tensor:

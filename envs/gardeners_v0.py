@@ -8,13 +8,17 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, ClassVar
 
+import numpy as np
 import torch
 from torch import Tensor
 
+from npa_envs.envs.core.base import to_output
 from npa_envs.envs.core.vector import checked_count
 from npa_envs.envs.garden.brush_actions import BrushSpaces
 from npa_envs.envs.gardener2d import Gardener2DEnv, GardenerTask
+from npa_envs.envs.multi.agents_env import state_space
 from npa_envs.envs.multi.parallel import KnownAgents, Outcome, in_turns, register
+from npa_envs.envs.multi.species_worlds import AGENT_REASONS
 from npa_envs.errors import NPAError, shown
 
 AGENTS = ("keeper_0", "raider_0")
@@ -56,7 +60,14 @@ class GardenersEnv(KnownAgents):
 
     ## Spaces, starting state and info
 
-    As those of `npa/Gardener2D-v0`, for each agent. Every agent has to give an action.
+    As those of `npa/Gardener2D-v0`, for each agent. Every agent has to give an action. Infos are
+    numbers with the same keys after resets and steps; `reason` is 0 until the last step, then 4 for
+    the time limit, 5 for success or 6 for a world that diverged.
+
+    ## State
+
+    `state()` is for central critics: float32, shape [N, 2 + C + 1], a row [position; state; 1] for
+    each particle, as with [several species](MultiSpecies.md#state). `state_space` is its space.
 
     ## Reward
 
@@ -93,6 +104,14 @@ class GardenersEnv(KnownAgents):
         self.agents: list[str] = []
         self.observation_spaces = dict.fromkeys(AGENTS, self.garden.observation_space)
         self.action_spaces = dict.fromkeys(AGENTS, self.garden.action_space)
+        worlds = self.garden.worlds
+        self.state_space = state_space(worlds.physics, worlds.x.shape[1])
+        """Space of `state`: float32, shape [N, 2 + C + 1]."""
+
+    @property
+    def np_random(self) -> np.random.Generator:
+        """Generator of the seeds of episodes, which a `reset` with a seed begins anew."""
+        return self.garden.np_random
 
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
@@ -100,10 +119,11 @@ class GardenersEnv(KnownAgents):
         """Start an episode; return both agents' observations and infos."""
         observation, info = self.garden.reset(seed=seed)
         self.agents = list(AGENTS)
-        return _for_both(observation), {agent: dict(info) for agent in AGENTS}
+        return _for_both(observation), _infos(info)
 
     def step(self, actions: Mapping[str, Any]) -> Outcome:
         """Apply both agents' actions and step the rule; return an `Outcome`."""
+        self.garden.check_begun("step needs a world")
         if not self.agents and not actions:
             return {}, {}, {}, {}, {}
         if not self.agents or set(actions) != set(self.agents):
@@ -119,15 +139,22 @@ class GardenersEnv(KnownAgents):
             {"keeper_0": float(reward), "raider_0": -float(reward)},
             dict.fromkeys(AGENTS, terminated),
             dict.fromkeys(AGENTS, truncated),
-            {agent: dict(info) for agent in AGENTS},
+            _infos(info),
         )
+
+    def state(self) -> Any:
+        """Return the whole world, for central critics: a row [position; state; 1] a particle."""
+        self.garden.check_begun("state needs a world")
+        x, s = self.garden.particles()
+        state = torch.cat((x, s, torch.ones_like(x[:, :1])), dim=1)
+        return to_output(state, self.garden.config.output)
 
     def render(self) -> Any:
         """Return the world's picture, uint8, [R, R, 3]; None unless `render_mode="rgb_array"`."""
         return self.garden.render()
 
     def close(self) -> None:
-        """Close the window, if there is one."""
+        """End the world, and close the window, if there is one."""
         self.garden.close()
 
 
@@ -135,6 +162,14 @@ def _for_both(observation: Any) -> dict[str, Any]:
     # Copies, so that one agent's changes do not reach the other's.
     copied = observation.clone if isinstance(observation, Tensor) else observation.copy
     return {agent: copied() for agent in AGENTS}
+
+
+def _infos(info: dict[str, Any]) -> dict[str, dict[str, Any]]:
+    """Return both agents' infos: numbers, and the same entries after a reset as after a step."""
+    gains = {f"reward_{n[5:]}": 0.0 for n in info if n.startswith("loss_")}
+    info = gains | {"success": False, "diverged": False} | info
+    info["reason"] = AGENT_REASONS.tolist().index(info.get("reason"))
+    return {agent: dict(info) for agent in AGENTS}
 
 
 def parallel_env(max_cycles: int = 32, **config: Any) -> GardenersEnv:

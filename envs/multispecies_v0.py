@@ -70,9 +70,9 @@ class MultiSpeciesEnv(CrowdEnv):
     ## Action space
 
     `Box(-1, 1, (N_k, A), float32)` with A = 2 + C, for species k. The columns, and what they do,
-    are those of [`npa/Morphogenesis2D-v0`](Morphogenesis2D.md#action-space). Every live agent has
-    to give an action, and no other agent may: see `agents`. A wrong action, or one that is not
-    finite, raises `NPAError` and does not change the world.
+    are those of [`npa/Morphogenesis2D-v0`](Morphogenesis2D.md#action-space). Every agent in
+    `agents` has to give an action; those of agents that ended are ignored. A wrong action, or one
+    that is not finite, raises `NPAError` and does not change the world.
 
     ## Reward
 
@@ -112,10 +112,10 @@ class MultiSpeciesEnv(CrowdEnv):
 
     | Cause | Ends | Returned as | `info["reason"]` |
     |---|---|---|---|
-    | a pair of `deaths` names the species and this step | the species | terminated | `"removed"` |
-    | all its particles are out of bounds | the species | terminated | `"left the world"` |
-    | one side of an invasion is gone | all | terminated | `"no opponent"` |
-    | `max_cycles` steps are done | all | truncated | `"time limit"` |
+    | a pair of `deaths` names the species and this step | the species | terminated | 1, removed |
+    | all its particles are out of bounds | the species | terminated | 2, left the world |
+    | one side of an invasion is gone | all | terminated | 3, no opponent |
+    | `max_cycles` steps are done | all | truncated | 4, time limit |
 
     A particle is out of bounds if a coordinate is clipped to ±`position_limit` or a state to
     ±`observation_limit`. As long as others of its species are within bounds, it stays and may come
@@ -125,15 +125,18 @@ class MultiSpeciesEnv(CrowdEnv):
 
     ## Info
 
-    One dict for each agent that acted.
+    One dict of numbers for each agent that acted, with the same keys after resets and steps.
 
-    | Key | In | Value |
-    |---|---|---|
-    | `species` | reset, step | the agent's species, from 0 on |
-    | `loss` | reset, step | the current loss L_k |
-    | `loss_separation`, ... | reset, step | its terms, by their names above |
-    | `reward_separation`, ... | step | decrease of each term in this step |
-    | `reason` | last step | why the agent's episode ended, see above |
+    | Key | Value |
+    |---|---|
+    | `species` | the agent's species, from 0 on |
+    | `loss` | the current loss L_k |
+    | `loss_separation`, ... | its terms, by their names above |
+    | `reward_separation`, ... | decrease of each term in this step |
+    | `reason` | why the agent's episode ended, see above; 0 before |
+
+    `npa_envs.envs.multi.AGENT_REASONS` has the word of each number of `reason`. `batched` has words
+    instead of numbers, in steps in which episodes end.
 
     ## State
 

@@ -76,13 +76,15 @@ class ParticlesEnv(CrowdEnv):
 
     ## Info
 
-    | Key | In | Value |
-    |---|---|---|
-    | `species` | reset, step | the particle's species, from 0 on |
-    | `loss` | reset, step | its current loss |
-    | `loss_separation`, ... | reset, step | the same by the name of its term, see above |
-    | `reward_separation`, ... | step | its decrease in this step |
-    | `reason` | last step | why the particle's episode ended |
+    As for [several species](MultiSpecies.md#info), of the particle.
+
+    | Key | Value |
+    |---|---|
+    | `species` | the particle's species, from 0 on |
+    | `loss` | its current loss |
+    | `loss_separation`, ... | the same by the name of its term, see above |
+    | `reward_separation`, ... | its decrease in this step |
+    | `reason` | why the particle's episode ended; 0 before |
 
     ## Arguments
 

@@ -154,7 +154,7 @@ class PointClassificationEnv(NPAEnv):
     run it as a policy: `gym.make(id, rule="rule.safetensors")` with
     `npa_envs.agents.RulePolicy(npa_envs.load_rule("rule.safetensors"), env)`.
 
-    `data="digits"` needs `pip install 'npa-envs[points]'`; see [point
+    `data="digits"` needs `pip install 'npa-envs[envs]'`; see [point
     clouds](../point_classification.md) for MNIST and data of your own.
 
     ## Action space

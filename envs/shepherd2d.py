@@ -86,16 +86,6 @@ class GoalBrushes(BrushSpaces):
             for name, part in zip(names, parts, strict=True)
         }
 
-    def final_observation_output(self, observation: Tensor, ended: NDArray[np.bool_]) -> Any:
-        """Return `infos["final_obs"]`; for NumPy an array of dictionaries and None, [B]."""
-        batched = self.observation_output(observation)
-        if self._output == "torch":
-            return batched
-        last = np.full(len(ended), None, dtype=object)
-        for k in np.flatnonzero(ended):
-            last[k] = {name: value[k] for name, value in batched.items()}
-        return last
-
 
 class ShepherdEpisode(NamedTuple):
     """The `context` of B episodes: `StartLosses`, the creature's goal, its moments at the start."""

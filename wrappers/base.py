@@ -16,6 +16,7 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 from torch import Tensor
 
+from npa_envs.envs.core.base import per_world
 from npa_envs.envs.core.single import NPAEnv
 from npa_envs.envs.core.vector import AUTORESET_MODES, BatchedSpaces, NPAVectorEnv
 from npa_envs.errors import NPAError, shown
@@ -129,7 +130,7 @@ def own_rewards(infos: dict[str, Any]) -> Any:
     rewards = infos.get("particle_reward")
     last = infos.get("final_info", {}).get("particle_reward")
     if rewards is None or last is None:
-        return rewards
+        return last if rewards is None else rewards
     which = as_tensor(infos["_final_info"])[:, None]
     return torch.where(which, as_tensor(last), as_tensor(rewards))
 
@@ -412,8 +413,16 @@ class VectorObservations(ChangesObservations, EpisodeWrapper):
         observations, rewards, terminations, truncations, infos = outcome
         observations = self._updated(observations)
         if "final_obs" in infos:
-            infos = infos | {"final_obs": self.changed(infos["final_obs"])}
+            infos = infos | {"final_obs": self._changed_last(infos["final_obs"])}
         return observations, rewards, terminations, truncations, infos
+
+    def _changed_last(self, last: Any) -> Any:
+        """Return last observations changed; arrays of worlds are objects, as environments' are."""
+        if isinstance(last, Tensor) or last.dtype != object:
+            return self.changed(last)
+        which = np.array([one is not None for one in last])
+        some = last[which.argmax()]
+        return per_world(self.changed(np.stack([some if w is None else w for w in last])), which)
 
     def _updated(self, observations: Any) -> Any:
         """Update the statistics with the new observations, and return all observations, changed."""

@@ -72,8 +72,8 @@ def _recorded(env: Any, policy: Callable[[Any], Any], seeds: list[int]) -> list[
     while not lengths.all():
         action = policy(observation)
         if isinstance(env.single_action_space, gymnasium.spaces.Box):
-            # As environments do.
-            action = action.clip(-1.0, 1.0)
+            # As environments do, which may also take another shape.
+            action = action.clip(-1.0, 1.0).reshape(len(seeds), *env.single_action_space.shape)
         observation, *outcome, infos = env.step(action)
         steps.append(tuple(map(_host, (action, *outcome))))
         ended = (steps[-1][2] | steps[-1][3]) & (lengths == 0)

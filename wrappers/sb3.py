@@ -238,7 +238,8 @@ class _EpisodeRows(RowVecEnv):
             last = {n: values[worlds] for n, values in self._row_observations(final).items()}
             return [{name: rows[k] for name, rows in last.items()} for k in range(len(worlds))]
         if not isinstance(final, Tensor) and final.dtype == object:
-            return list(final[worlds])
+            some = list(final[worlds])
+            return some if isinstance(some[0], dict) else self._row_observations(np.stack(some))
         # Only ended worlds are copied.
         rows = as_tensor(final)
         return self._row_observations(rows[torch.from_numpy(worlds).to(rows.device)])

@@ -5,11 +5,17 @@ from __future__ import annotations
 from typing import Any
 
 import torch
-from gymnasium.spaces import Box
+from gymnasium.spaces import Box, Dict
 from torch import Tensor
 
-from npa_envs.errors import NPAError, importing
-from npa_envs.wrappers.base import AnyVectorEnv, autoreset_mode, check_autoreset, torch_env
+from npa_envs.errors import NPAError, importing, shown
+from npa_envs.wrappers.base import (
+    AnyVectorEnv,
+    autoreset_mode,
+    check_autoreset,
+    row_space,
+    torch_env,
+)
 
 with importing("TorchRL", "NPATorchRLEnv", "pip install 'npa-envs[torchrl]'"):
     from tensordict import TensorDict, TensorDictBase
@@ -21,8 +27,10 @@ class NPATorchRLEnv(EnvBase):  # type: ignore[misc]
     """B worlds as one TorchRL environment of batch size [B], or of [B, N] with `rows=True`.
 
     Entries are `observation` [B, N, P], `action` [B, N, A], and `reward`, `done`, `terminated` and
-    `truncated`, [B, 1] each. TorchRL restarts worlds itself, each when its own episode is over.
-    World k, seeded with s, has the episodes of the single environment seeded with s + k.
+    `truncated`, [B, 1] each. Where observations are dictionaries, as in `npa/Shepherd2D-v0`, their
+    entries stand in the place of `observation`. TorchRL restarts worlds itself, each when its own
+    episode is over. World k, seeded with s, has the episodes of the single environment seeded with
+    s + k.
 
     With `rows=True` every particle is an element of the batch, so TorchRL's losses for one agent
     train one small policy that all particles share. `observation` and `action` keep their shapes,
@@ -48,12 +56,13 @@ class NPATorchRLEnv(EnvBase):  # type: ignore[misc]
         self.rows = rows
         self.particle_count = count
         self._first_seed: int | None = None
-        observed, acted = (
-            _bounded(space, worlds, self.device)
-            for space in (env.single_observation_space, env.single_action_space)
-        )
-        self.observation_spec = Composite(observation=observed, shape=batch, device=self.device)
-        self.action_spec = acted
+        space = env.single_observation_space
+        if rows:
+            row_space(space)
+        named = space.spaces if isinstance(space, Dict) else {"observation": space}
+        observed = {name: _bounded(part, worlds, self.device) for name, part in named.items()}
+        self.observation_spec = Composite(observed, shape=batch, device=self.device)
+        self.action_spec = _bounded(env.single_action_space, worlds, self.device)
         self.reward_spec = Unbounded(shape=(*batch, 1), device=self.device)
         flag = Categorical(2, shape=(*batch, 1), dtype=torch.bool, device=self.device)
         names = ("done", "terminated", "truncated")
@@ -105,16 +114,20 @@ class NPATorchRLEnv(EnvBase):  # type: ignore[misc]
             return values[:, None]
         return values[:, None, None].expand(-1, self.particle_count, -1).clone()
 
-    def _entries(self, observation: Tensor, **entries: Tensor) -> TensorDictBase:
+    def _entries(self, observation: Any, **entries: Tensor) -> TensorDictBase:
         """Return a TensorDict of an observation and other results of a reset or a step."""
-        entries["observation"] = observation
+        entries |= observation if isinstance(observation, dict) else {"observation": observation}
         result: TensorDictBase = TensorDict(entries, self.batch_size, device=self.device)
         return result
 
 
 def _bounded(space: Any, world_count: int, device: torch.device | None) -> Bounded:
     """Return the space of one world as TorchRL's spec of `world_count` worlds."""
-    assert isinstance(space, Box), "environments of this package have boxes"
+    if not isinstance(space, Box):
+        raise NPAError(
+            f"env must have actions that are numbers, got {shown(space)}: leave out "
+            "actions='discrete' or 'choice'"
+        )
     low, high = (
         torch.as_tensor(limit, device=device).expand(world_count, *space.shape).clone()
         for limit in (space.low, space.high)

@@ -311,7 +311,10 @@ class GardenPolicy:
         self._shapes = _shapes(space.spaces if isinstance(space, Dict) else space)
 
     def __call__(self, observation: Any) -> NDArray[np.float32]:
-        """Return actions [B, J, W] of J brushes, W columns each, for observations [B, ...]."""
+        """Return actions for observations [B, ...], in the shape that the model was trained with.
+
+        Gardens take the rows of brushes as [B, J W] and as [B, J, W].
+        """
         shapes = {name: shape[1:] for name, shape in _shapes(observation).items()}
         if shapes != self._shapes:
             raise NPAError(

@@ -53,13 +53,29 @@ class ParticleSpaces:
         return to_output(observation, self._output)
 
     def final_observation_output(self, observation: Tensor, ended: NDArray[np.bool_]) -> Any:
-        """Return `infos["final_obs"]`, [B, ...]; `ended`: in which worlds an episode ended, [B]."""
-        return self.observation_output(observation)
+        """Return `infos["final_obs"]` for observations [B, ...]; `ended`: of which worlds, [B].
+
+        Tensors are those of all worlds. Arrays are objects of an array, and None elsewhere.
+        """
+        batched = self.observation_output(observation)
+        return batched if self._output == "torch" else per_world(batched, ended)
 
 
 def to_output(tensor: Tensor, output: str) -> Any:
     """Return a tensor as it is if `output` is "torch", as a NumPy array if it is "numpy"."""
     return tensor if output == "torch" else tensor.cpu().numpy()
+
+
+def per_world(batched: Any, which: NDArray[np.bool_]) -> NDArray[Any]:
+    """Return observations of worlds, objects [B], from an array [B, ...] or a dict of arrays.
+
+    Worlds where `which`, [B], is False have None.
+    """
+    worlds = np.full(len(which), None, dtype=object)
+    for k in np.flatnonzero(which):
+        is_dict = isinstance(batched, dict)
+        worlds[k] = {n: rows[k] for n, rows in batched.items()} if is_dict else batched[k]
+    return worlds
 
 
 def batch_tensor(
@@ -130,6 +146,7 @@ class ShownEnv:
     metadata: Any = {"render_modes": ["rgb_array", "human"], "render_fps": 25}  # noqa: RUF012
     _is_batch: ClassVar[bool] = False
     _started = False
+    _closed = False
     _window: Window | None = None
 
     def render(self) -> Any:
@@ -137,8 +154,7 @@ class ShownEnv:
 
         The result is None unless `render_mode` is "rgb_array".
         """
-        if not self._started:
-            raise NPAError("render needs worlds: call reset first")
+        self.check_begun("render needs worlds")
         if self.config.render_mode is None:
             gymnasium.logger.warn(
                 "render() draws nothing without a render_mode: make the environment with "
@@ -149,6 +165,12 @@ class ShownEnv:
             return None
         pictures = tuple(self.worlds.pictures(self.worlds.world_count))
         return pictures if self._is_batch else pictures[0]
+
+    def check_begun(self, what: str) -> None:
+        """Raise an NPAError unless there are worlds; `what` needs them, as "step needs worlds"."""
+        if not self._started:
+            closed = ", which close has ended" if self._closed else ""
+            raise NPAError(f"{what}{closed}: call reset first")
 
     def _repr_mimebundle_(self, include: Any = None, exclude: Any = None) -> dict[str, Any]:
         """Return what Jupyter displays: text, and after a reset pictures of the first worlds."""
@@ -173,7 +195,8 @@ class ShownEnv:
         self._window.show(frame.reshape(across * size, across * size, 3))
 
     def close(self) -> None:
-        """Close the window, if there is one."""
+        """End all worlds, until the next reset, and close the window, if there is one."""
+        self._started, self._closed = False, True
         if self._window is not None:
             self._window.close()
             self._window = None

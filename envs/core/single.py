@@ -15,7 +15,6 @@ from npa_envs.envs.core.base import WorldsEnv
 from npa_envs.envs.core.config import as_python
 from npa_envs.envs.core.step_report import reason
 from npa_envs.envs.core.vector import check_options, rng_keys
-from npa_envs.errors import NPAError
 from npa_envs.world.environment_steps import DIVERGED, SUCCESS, TIME_LIMIT
 
 
@@ -93,10 +92,11 @@ class NPAEnv(WorldsEnv, gymnasium.Env[Any, Any]):
 
     - With `output="torch"` results are tensors on the device, and actions may be too. Only the
       flags of episode ends are copied to the host.
-    - Infos are arrays of shape [B] with masks, as Gymnasium's vector environments have them.
+    - Infos are those of Gymnasium's `SyncVectorEnv`: arrays of shape [B] with masks. As tensors
+      they are of all worlds, and the masks say which count.
     - With `autoreset_mode="same-step"`, the default, a world whose episode is over starts the next
-      one at once: the last observation is in `infos["final_obs"]`, the last infos in
-      `infos["final_info"]`.
+      one at once: the last observation is in `infos["final_obs"]`, an object array with None for
+      other worlds, or a tensor of all worlds; the last infos are in `infos["final_info"]`.
     - `reset(options={"reset_mask": mask})` resets some worlds and does not change the others.
 
     `env.unwrapped.particles()` returns positions and states, and `place_particles(x, s)` replaces
@@ -157,8 +157,7 @@ class NPAEnv(WorldsEnv, gymnasium.Env[Any, Any]):
             DivergedError: The action is not finite, and the world is not changed; or the world
                 diverged, and `on_divergence` is "raise".
         """
-        if not self._started:
-            raise NPAError("step needs a world: call reset first")
+        self.check_begun("step needs a world")
         worlds = self.worlds
         checked = self.spaces.action(action, None)
         with worlds.device_context():
@@ -186,8 +185,7 @@ class NPAEnv(WorldsEnv, gymnasium.Env[Any, Any]):
 
         Positions, [N, D], and states, [N, C], must be finite and within their limits.
         """
-        if not self._started:
-            raise NPAError("particles need a world: call reset first")
+        self.check_begun("particles need a world")
         x, s = number_tensor("x", x)[None], number_tensor("s", s)[None]
         placed = self.worlds.checked_particles(x, s, 1, self.config.particle_count)
         observation = self._change_worlds(self.worlds.place, self._world_index, placed)

@@ -118,8 +118,7 @@ class NPAVectorEnv(WorldsEnv, BatchedSpaces):
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
         """Apply actions, shape [B, N, A]; return a batch [B, ...] of what `NPAEnv.step` returns."""
-        if not self._started:
-            raise NPAError("step needs worlds: call reset first")
+        self.check_begun("step needs worlds")
         action = self.spaces.action(actions, self.num_envs)
         with self.worlds.device_context():
             return self._step(action)
@@ -153,6 +152,8 @@ class NPAVectorEnv(WorldsEnv, BatchedSpaces):
             observation, infos = self._restart_ended(ended, observation, infos)
         else:
             self._ended = ended
+        if self.config.output == "numpy" and (any_ended or restarting):
+            infos = own_entries(infos)
         self._show()
         return self.spaces.observation_output(observation), *results, infos
 
@@ -176,7 +177,7 @@ class NPAVectorEnv(WorldsEnv, BatchedSpaces):
     close = VectorEnv.close
 
     def close_extras(self, **kwargs: Any) -> None:
-        """Close the window, if there is one."""
+        """End all worlds, and close the window, if there is one."""
         WorldsEnv.close(self)
 
     def particles(self) -> tuple[Tensor, Tensor]:
@@ -189,8 +190,7 @@ class NPAVectorEnv(WorldsEnv, BatchedSpaces):
         Positions have shape [B', N, D], states [B', N, C]; `worlds` are the worlds' indices, each
         once, or None for all of them. Errors are those of `NPAEnv.place_particles`.
         """
-        if not self._started:
-            raise NPAError("particles need worlds: call reset first")
+        self.check_begun("particles need worlds")
         all_worlds = torch.arange(self.num_envs)
         chosen = all_worlds if worlds is None else checked_worlds(worlds, self.num_envs)
         placed = self.worlds.checked_particles(x, s, len(chosen), self.config.particle_count)
@@ -216,7 +216,12 @@ class NPAVectorEnv(WorldsEnv, BatchedSpaces):
         return rows[0], terminated, truncated, infos
 
     def _returned_values(self, values: dict[str, Tensor], *, copy: bool = True) -> dict[str, Any]:
-        return {n: self._out(v.clone() if copy else v) for n, v in values.items()}
+        """Return values by name, [B, ...] each, as `config.output`; numbers as float64 arrays."""
+        found = {n: self._out(v.clone() if copy else v) for n, v in values.items()}
+        if self.config.output == "torch":
+            return found
+        of_numbers = [n for n, v in found.items() if v.ndim == 1 and v.dtype == np.float32]
+        return found | {n: found[n].astype(np.float64) for n in of_numbers}
 
     def _report_rows(self, report: StepReport) -> Sequence[Any]:
         """Return the rows of `report.numbers`, [B] each, as tensors or float64 arrays."""
@@ -239,6 +244,25 @@ def with_masks(values: dict[str, Any], which: Any) -> dict[str, Any]:
     for name, value in values.items():
         infos[name], infos[f"_{name}"] = value, which
     return infos
+
+
+def own_entries(infos: dict[str, Any]) -> dict[str, Any]:
+    """Return infos of arrays as `SyncVectorEnv` has them: by the masks, [B], that they come with.
+
+    Where a mask is False the value is 0. An entry that no world has is left out.
+    """
+    own = {}
+    for name, value in infos.items():
+        which = infos.get(f"_{name}")
+        if which is None or not which.any():
+            continue
+        if isinstance(value, dict):
+            value = own_entries(value)
+        elif value.dtype != object and not which.all():
+            value = value.copy()
+            value[~which] = 0
+        own[name], own[f"_{name}"] = value, which
+    return own
 
 
 def vector_class(env_type: type[WorldsEnv], *mixins: type[Any]) -> type[NPAVectorEnv]:

@@ -15,6 +15,7 @@ from npa_envs.envs.core.task import Start
 from npa_envs.envs.garden.brush_actions import (
     OBSERVATION_LIMIT,
     VALUES_PER_PLACE,
+    BrushLayout,
     BrushSpaces,
     GardenConfig,
     apply_brushes,
@@ -110,7 +111,11 @@ class GardenTask(RuleDrivenTask[Config], GrownTask[Config]):
     def step(
         self, x: Tensor, s: Tensor, action: Tensor, random: WorldRandom
     ) -> tuple[Tensor, Tensor]:
-        """Return x and s after brushes, steps of the rule and `disturb`; differentiable."""
+        """Return x and s after brushes, steps of the rule and `disturb`; differentiable.
+
+        `action` has J rows of W columns for each world, [B, J, W] or [B, J W].
+        """
+        action = action.reshape(len(x), -1, BrushLayout.for_config(self.config).width)
         x, s, *_ = self.disturb(self.brush_and_roll(Particles(x, s), action, random), random)
         return x, s
 
@@ -211,9 +216,10 @@ class GardenEnv(NPAEnv):
 
     ## Action space
 
-    With `actions="grid"`, `Box(-1, 1, (P², W), float32)`: a row for the brush at each place of the
-    grid. All brushes act at once, their effects add up, and then the rule makes `rule_steps` steps.
-    Zeros have no effect.
+    With `actions="grid"`, `Box(-1, 1, (P² W,), float32)`: a row of W columns for the brush at each
+    place of the grid, row after row. With `action_shape="brushes"` the shape is [P², W]; `step`
+    takes both, whatever `action_shape` is. All brushes act at once, their effects add up, and then
+    the rule makes `rule_steps` steps. Zeros have no effect.
 
     | Columns | Action a | An action of 1 is | Effect at the brush's weight w |
     |---|---|---|---|
@@ -229,13 +235,18 @@ class GardenEnv(NPAEnv):
     is differentiable, except that the moment correction of
     [perception](../mathematics.md#perception) counts as constant.
 
-    With `actions="free"`, `Box(-1, 1, (J, 2 + W), float32)`: there are J = `brush_count` brushes,
-    and the first two columns are the position of each, along x and y [length units].
+    With `actions="free"` there are J = `brush_count` brushes of 2 + W columns each, J (2 + W)
+    numbers. The first two columns are a brush's position, along x and y [length units].
 
     With `actions="discrete"`, `MultiDiscrete` with four choices for each of J brushes: its place on
     the grid along x and along y; its tool (nothing, a push in one of eight directions, wipe, each
     channel up or down, rate 0, rate 2, as far as `tools` has them); and its strength, one of
     `strength_count`.
+
+    ## Version history
+
+    - v0: first version. Actions of preliminary versions were rows, as with
+      `action_shape="brushes"`; worlds, rewards and returns are the same.
 
     ## Info
 

@@ -27,6 +27,7 @@ VALUES_PER_PLACE = 6
 """Number of values observed at a place of the grid: count, x, y, red, green, blue."""
 
 BrushActions = Literal["grid", "free", "discrete"]
+ActionShape = Literal["flat", "brushes"]
 Observe = Literal["grid", "picture", "moments"]
 GARDEN_REWARDS = "dense", "sparse"
 
@@ -42,6 +43,7 @@ class GardenConfig(GrownConfig):
     choices = GrownConfig.choices | {
         "reward": GARDEN_REWARDS,
         "actions": get_args(BrushActions),
+        "action_shape": get_args(ActionShape),
         "observe": get_args(Observe),
     }
 
@@ -75,6 +77,10 @@ class GardenConfig(GrownConfig):
     """Form of actions: "grid", a brush at each place of a grid; "free", brushes whose positions are
     part of the action; or "discrete", a place of the grid, a tool and a strength for each brush, as
     Gymnasium's MultiDiscrete."""
+
+    action_shape: ActionShape = "flat"
+    """Shape of actions that are no choices: "flat", the rows of all brushes one after another, or
+    "brushes", a row for each; `step` takes both."""
 
     place_count: int = 4
     """Places on each side of the grid."""
@@ -237,14 +243,20 @@ class BrushSpaces(ParticleSpaces):
         """Shape (J, W) of a world's rows of brushes."""
         self._tools = tool_table(config)
         self._choices = [config.place_count] * 2 + [len(self._tools), config.strength_count]
-        self.action_space: Space[Any] = Box(-1.0, 1.0, self.rows_shape, np.float32)
+        flat = (count * self.rows_shape[1],)
+        self.action_shape = flat if config.action_shape == "flat" else self.rows_shape
+        """Shape of a world's actions, unless they are choices: (J W,), or (J, W)."""
+        self.action_space: Space[Any] = Box(-1.0, 1.0, self.action_shape, np.float32)
         if config.actions == "discrete":
             self.action_space = MultiDiscrete(self._choices * config.brush_count)
 
     def action(self, action: Any, world_count: int | None) -> Tensor:
-        """Return checked actions float32, [B, J, W]: W columns for each of J brushes."""
+        """Return checked actions float32, [B, J, W]: W columns for each of J brushes.
+
+        Actions that are no choices may have either form of `action_shape`.
+        """
         if self._config.actions != "discrete":
-            return batch_tensor(action, world_count, self.rows_shape, "J, W")
+            return self._rows(action, world_count)
         brushes = self._config.brush_count
         chosen = batch_tensor(action, world_count, (4 * brushes,), "4 J", discrete=True)
         chosen = chosen.view(-1, brushes, 4)
@@ -259,3 +271,11 @@ class BrushSpaces(ParticleSpaces):
         places = grid_places(config, chosen.device)[up * config.place_count + across]
         strength = (chosen[..., 3:] + 1.0) / config.strength_count
         return torch.cat((places, strength * tools[chosen[..., 2]]), dim=-1)
+
+    def _rows(self, action: Any, world_count: int | None) -> Tensor:
+        """Return checked rows of brushes, [B, J, W], from actions [J W] or [J, W] of each world."""
+        flat = (self.rows_shape[0] * self.rows_shape[1],)
+        forms = {1: (flat, "J W"), 2: (self.rows_shape, "J, W")}
+        dimensions = getattr(action, "ndim", 0) - (world_count is not None)
+        shape, letters = forms.get(dimensions, forms[len(self.action_shape)])
+        return batch_tensor(action, world_count, shape, letters).reshape(-1, *self.rows_shape)

@@ -7,5 +7,6 @@ the particles. Nothing but `parallel` needs PettingZoo.
 
 from npa_envs.envs.multi.shipped_tasks import TASKS, task_type
 from npa_envs.envs.multi.species_task import Population, SpeciesConfig, SpeciesTask
+from npa_envs.envs.multi.species_worlds import AGENT_REASONS
 
-__all__ = ["TASKS", "Population", "SpeciesConfig", "SpeciesTask", "task_type"]
+__all__ = ["AGENT_REASONS", "TASKS", "Population", "SpeciesConfig", "SpeciesTask", "task_type"]

@@ -17,6 +17,7 @@ from npa_envs.envs.core.config import as_python
 from npa_envs.envs.core.vector import rng_keys
 from npa_envs.envs.multi.species_worlds import SpeciesWorlds
 from npa_envs.errors import DivergedError, NPAError, shown
+from npa_envs.world.environment_steps import Physics
 
 
 class AgentsEnv(ShownEnv):
@@ -46,11 +47,7 @@ class AgentsEnv(ShownEnv):
             self.single_action_spaces[agent] = Box(
                 -1.0, 1.0, (*rows, physics.action_dim), np.float32
             )
-        # Position, state, present.
-        high = [limits.position] * physics.space_dim + [limits.state] * physics.state_dim
-        upper = np.tile(np.array([*high, 1.0], np.float32), (worlds.particle_count, 1))
-        lower = upper * np.array([-1.0] * len(high) + [0.0], np.float32)
-        self.single_state_space = Box(lower, upper)
+        self.single_state_space = state_space(physics, worlds.particle_count)
         """Space of one world's `state`: float32, shape [N, 2 + C + 1]."""
         self.np_random: np.random.Generator | None = None
 
@@ -73,12 +70,19 @@ class AgentsEnv(ShownEnv):
         return observation
 
     def _state(self) -> Tensor:
-        if not self._started:
-            raise NPAError("state needs a world: call reset first")
+        self.check_begun("state needs a world")
         return self.worlds.state()
 
     def _show(self) -> None:
         self._show_in_window(f"{self.metadata['name']}: {self._task_name}")
+
+
+def state_space(physics: Physics, particle_count: int) -> Box:
+    """Return the space of a world's `state`: a row [position; state; 1] for each particle."""
+    limits = physics.limits
+    high = [limits.position] * physics.space_dim + [limits.state] * physics.state_dim
+    upper = np.tile(np.array([*high, 1.0], np.float32), (particle_count, 1))
+    return Box(upper * np.array([-1.0] * len(high) + [0.0], np.float32), upper)
 
 
 def joined_actions(
@@ -103,8 +107,7 @@ def joined_actions(
     extra = [str(agent) for agent in actions if agent not in live]
     if extra:
         raise NPAError(
-            f"actions must be of live agents only, got one for {_names(extra)}: agents that ended "
-            "get no more actions until reset; see env.agents"
+            f"actions must be of live agents only, got one for {_names(extra)}: see env.agents"
         )
     rows = [
         action_tensor(

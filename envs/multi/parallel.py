@@ -65,36 +65,42 @@ class CrowdEnv(AgentsEnv, KnownAgents):
         """Start an episode as `NPAEnv.reset` does; return all agents' observations and infos."""
         observation = self._start(np.arange(1), seed, seed)
         self._update_agents()
-        return self._by_agent(observation), self._infos(self.worlds.agent_returns.loss_infos())
+        # Nothing has been gained so far.
+        numbers = self.worlds.agent_returns.loss_infos(stepped=True)
+        return self._by_agent(observation), self._infos(numbers)
 
     def step(self, actions: Mapping[str, Any]) -> Outcome:
         """Apply an action of each live agent; return an `Outcome` for these agents.
 
+        Actions of agents whose episodes have ended are ignored.
+
         Raises:
-            NPAError: There is no world yet, or an action is missing, superfluous, or of another
-                shape; the world is not changed.
+            NPAError: There is no world yet, or an action is missing, of an unknown agent, or of
+                another shape; the world is not changed.
             DivergedError: An action is not finite, and the world is not changed; or an agent is
                 out of bounds, and `on_divergence` is "raise".
         """
-        if not self._started:
-            raise NPAError("step needs a world: call reset first")
+        self.check_begun("step needs a world")
         if not self.agents and isinstance(actions, Mapping):
             if not actions:
                 return {}, {}, {}, {}, {}
             raise NPAError("step needs a live agent, and there is none: call reset first")
+        if isinstance(actions, Mapping) and len(actions) > len(self.agents):
+            # Frame skips of SuperSuit repeat the actions of agents that have ended meanwhile.
+            over = self.action_spaces.keys() - set(self.agents)
+            actions = {agent: action for agent, action in actions.items() if agent not in over}
         worlds, acted, live = self.worlds, self.agents, self._live
         shapes = [self.action_spaces[agent].shape for agent in acted]
         action = joined_actions(actions, acted, shapes, worlds.device)
         with worlds.device_context():
             outcome = worlds.step(self._with_zeros(action))
-        infos, reasons = self._infos(outcome.numbers), outcome.reasons[0]
+        infos, causes = self._infos(outcome.numbers), outcome.causes[0].tolist()
         observations = self._by_agent(outcome.observation)
         all_rewards, endings = outcome.rewards[0].tolist(), outcome.endings[0].tolist()
         rewards, terminations = {}, {}
         for k, agent in zip(live, acted, strict=True):
             rewards[agent], terminations[agent] = all_rewards[k], endings[k] > 0
-            if reasons[k] is not None:
-                infos[agent]["reason"] = reasons[k]
+            infos[agent]["reason"] = causes[k]
         truncations = dict.fromkeys(acted, bool(outcome.truncated[0]))
         self._update_agents()
         self._show()
@@ -133,12 +139,13 @@ class CrowdEnv(AgentsEnv, KnownAgents):
         return all_rows
 
     def _infos(self, numbers: dict[str, Tensor]) -> Infos:
-        """Return infos of live agents: their species, and theirs of `numbers`, [1, M] each."""
+        """Return infos of live agents: species, no reason, and theirs of `numbers`, [1, M] each."""
         rows = torch.stack(list(numbers.values()))[:, 0].tolist()
         columns = dict(zip(numbers, rows, strict=True))
         species = self.worlds.agent_species
         return {
-            agent: {"species": int(species[k])} | {name: row[k] for name, row in columns.items()}
+            agent: {"species": int(species[k]), "reason": 0}
+            | {name: row[k] for name, row in columns.items()}
             for k, agent in zip(self._live, self.agents, strict=True)
         }
 

@@ -35,8 +35,10 @@ LossTerms = dict[str, Tensor]
 
 REMOVED, LEFT, NO_OPPONENT, TIME_LIMIT = 1, 2, 3, 4
 """Causes that end an agent's episode; the last one truncates it. 0: none."""
-AGENT_REASONS = np.array((None, "removed", "left the world", "no opponent", "time limit"), object)
-"""`info["reason"]` for each cause."""
+AGENT_REASONS = np.array(
+    (None, "removed", "left the world", "no opponent", "time limit", "success", "diverged"), object
+)
+"""Words for causes, by their numbers; the last two are of worlds with brushes."""
 
 
 class AgentOutcome(NamedTuple):
@@ -56,10 +58,15 @@ class AgentOutcome(NamedTuple):
     """Whether each world is truncated, shape [B]."""
 
     @property
-    def reasons(self) -> NDArray[Any]:
-        """`info["reason"]` of agents whose episodes ended in this step, else None, [B, M]."""
+    def causes(self) -> NDArray[np.int64]:
+        """Cause that ended each agent's episode in this step, 0 for none, shape [B, M]."""
         truncated = np.where(self.acted & self.truncated[:, None], TIME_LIMIT, 0)
-        return AGENT_REASONS[np.where(self.endings > 0, self.endings, truncated)]
+        return np.where(self.endings > 0, self.endings, truncated)
+
+    @property
+    def reasons(self) -> NDArray[Any]:
+        """The causes as words, None for none, shape [B, M]."""
+        return AGENT_REASONS[self.causes]
 
 
 class AgentReturns:

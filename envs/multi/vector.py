@@ -109,8 +109,7 @@ class MultiSpeciesVectorEnv(AgentsEnv):
 
         Rewards are float32. Errors are those of `CrowdEnv.step`.
         """
-        if not self._started:
-            raise NPAError("step needs worlds: call reset first")
+        self.check_begun("step needs worlds")
         worlds = self.worlds
         if not worlds.running.all():
             raise NPAError(

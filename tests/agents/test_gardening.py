@@ -125,6 +125,11 @@ def test_algorithms_as_they_come_learn_within_their_budget_and_can_be_loaded(
     observation, _ = problem.make_envs().reset(seed=0)
     action = trained.policy(observation)
     assert action.shape == (2, *problem.make_envs().single_action_space.shape)
+    # Policies of one shape of actions act where the other is the environment's.
+    rows = replace(problem, keywords={**problem.keywords, "action_shape": "brushes"})
+    assert rows.make_envs().single_action_space.shape != action.shape[1:]
+    same, other = (evaluate_policy(p.make_envs(), trained.policy, SEEDS) for p in (problem, rows))
+    assert np.array_equal(same.returns, other.returns)
     (path,) = trained.save(tmp_path)
     loaded = GardenPolicy.load(path)
     assert np.array_equal(loaded(observation), action)

@@ -293,7 +293,7 @@ PARTICLES = [
         r"'particle_7'\] must be real numbers of shape \(18,\)",
     ),
 ]
-BRUSHES = r"action must be real numbers of shape \[J, W\]"
+BRUSHES = r"action must be real numbers of shape \[J,? W\]"
 GARDENERS = [
     (
         lambda env: env.action_space("keeper"),

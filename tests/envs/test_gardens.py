@@ -9,14 +9,16 @@ import pytest
 import torch
 from pettingzoo.test import api_test, parallel_api_test, parallel_seed_test
 from support.refusals import refused
-from support.small_envs import begun, make, make_vec, small
+from support.small_envs import assert_same, begun, make, make_vec, small
 
 import npa_envs
+from npa_envs.agents.garden_policies import RandomGardener
 from npa_envs.agents.shapeshifter_policies import RecognisingShapeshifter
 from npa_envs.envs import gardeners_v0
 from npa_envs.envs.garden.base import StartLosses
 from npa_envs.envs.garden.brush_actions import BrushLayout, apply_brushes, grid_places
 from npa_envs.envs.gardener2d import Gardener2DEnv
+from npa_envs.envs.multi import AGENT_REASONS
 from npa_envs.registration import GARDENS
 from npa_envs.world.particles import Particles
 
@@ -77,6 +79,25 @@ def test_brushes_stand_on_the_grid_and_what_they_do_adds_up():
     assert torch.allclose(moved - x, 0.15 * held[None, :, None] * everywhere[0, 0], atol=1e-6)
 
 
+@pytest.mark.parametrize("form", [{}, {"actions": "free", "brush_count": 3}])
+@pytest.mark.parametrize("name", [GARDENER, SHEPHERD])
+def test_actions_are_flat_or_rows_of_brushes_and_every_step_takes_both(name, form):
+    many = {"action_shape": "brushes"} | form
+    alone = [make(name, **form), make(name, **many)]
+    batches = [make_vec(name, 2, **form), make_vec(name, 2, **many)]
+    rows = alone[1].action_space.shape
+    assert alone[0].action_space.shape == (rows[0] * rows[1],)
+    for envs, count in ((alone, ()), (batches, (2,))):
+        action = np.random.default_rng(0).uniform(-1.0, 1.0, (*count, *rows)).astype(np.float32)
+        given = action, action.reshape(*count, -1)
+        results = [begun(env, seed=1).step(one) for env in envs for one in given]
+        for result in results[1:]:
+            assert_same(results[0], result)
+        for env in envs:
+            acts = RandomGardener(env)(env.reset(seed=0)[0])
+            assert env.action_space.contains(acts)
+
+
 def test_what_lacks_is_seen_where_it_lacks():
     env = begun(make(GARDENER, particle_count=256, eps=0.1, resolution=32))
     task, target = env.unwrapped.task, env.unwrapped.task.task.target
@@ -132,7 +153,7 @@ def test_a_world_that_is_stopped_stays_as_it_is():
     env.step(action)
     assert not torch.equal(env.unwrapped.particles()[0], x)
     env.unwrapped.place_particles(x, s)
-    action[0, -1] = -1.0
+    action[-1] = -1.0
     _, reward, *_ = env.step(action)
     assert torch.allclose(env.unwrapped.particles()[0], x, atol=1e-5)
     assert torch.allclose(env.unwrapped.particles()[1], s, atol=1e-5)
@@ -165,7 +186,7 @@ def test_the_whole_world_is_differentiable_by_every_number_of_a_brush():
     (slope,) = torch.autograd.grad(worth(given), given)
     columns = BrushLayout.for_config(env.config)
     for column in range(columns.width):
-        assert float(slope[0, :, column].abs().sum()) > 0.0, column
+        assert float(slope[0, column :: columns.width].abs().sum()) > 0.0, column
     way = torch.rand(shape, generator=generator, dtype=torch.float64) - 0.5
     step = 1e-6
     difference = (worth(action + step * way) - worth(action - step * way)) / (2.0 * step)
@@ -305,6 +326,25 @@ def test_what_one_earns_the_other_loses_until_the_time_limit():
     refused("actions must be given for the agents", env.step, actions)
 
 
+def test_two_gardeners_have_a_state_a_generator_and_the_same_numbers_in_all_infos():
+    env = gardeners_v0.parallel_env(max_cycles=2, **GARDEN)
+    refused("state needs a world: call reset first", env.state)
+    _, infos = env.reset(seed=3)
+    assert env.np_random.bit_generator.state == begun(env, seed=3).np_random.bit_generator.state
+    names, reasons = set(infos["keeper_0"]), []
+    while env.agents:
+        x, s = env.garden.particles()
+        assert np.array_equal(env.state(), torch.cat((x, s, torch.ones(61, 1)), dim=1))
+        assert env.state_space.contains(env.state())
+        *_, infos = env.step({agent: env.action_space(agent).sample() for agent in env.agents})
+        assert set(infos["keeper_0"]) == set(infos["raider_0"]) == names
+        assert all(isinstance(value, int | float) for value in infos["keeper_0"].values())
+        reasons.append(AGENT_REASONS[infos["keeper_0"]["reason"]])
+    assert reasons == [None, "time limit"]
+    env.close()
+    refused("step needs a world, which close has ended", env.step, {})
+
+
 def test_brushes_of_both_add_up_and_without_a_raider_it_is_the_gardeners_world():
     both, alone = begun(
         gardeners_v0.parallel_env(**GARDEN),
@@ -393,7 +433,7 @@ def test_slowed_particles_cross_the_edge_of_a_periodic_box_by_the_shortest_way()
     worlds, task = envs.unwrapped.worlds, envs.unwrapped.worlds.task
     before = worlds.particles._replace(x=worlds.particles.x + 1.0)
     before = before._replace(x=before.x - 2.0 * (before.x / 2.0).round())
-    action = torch.full((2, *envs.single_action_space.shape), -0.5)
+    action = torch.full((2, *envs.unwrapped.spaces.rows_shape), -0.5)
     after = task.brush_and_roll(before, action, worlds.random)
     moved = after.x - before.x
     moved -= 2.0 * (moved / 2.0).round()

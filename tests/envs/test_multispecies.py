@@ -14,6 +14,7 @@ from support.small_envs import begun
 
 import npa_envs
 from npa_envs.envs import multispecies_v0, particles_v0
+from npa_envs.envs.multi import AGENT_REASONS as REASONS
 from npa_envs.envs.multi import TASKS as TABLE
 from npa_envs.world.randomness import StreamId
 
@@ -54,8 +55,8 @@ def test_a_species_that_is_removed_is_gone():
     observations, rewards, terminations, truncations, infos = env.step(still(env))
     assert terminations == {"species_0": False, "species_1": True, "species_2": False}
     assert not any(truncations.values())
-    assert infos["species_1"]["reason"] == "removed"
-    assert "reason" not in infos["species_0"]
+    assert REASONS[infos["species_1"]["reason"]] == "removed"
+    assert infos["species_0"]["reason"] == 0
     assert rewards == dict.fromkeys(terminations, 0.0)
     assert env.agents == ["species_0", "species_2"]
     x, s = env.particles()
@@ -71,12 +72,12 @@ def test_a_species_that_is_removed_is_gone():
     assert (own[:, 0] > 0.0).all()
     assert own[:, 3:5].any()
     assert not own[:, [1, 5, 6]].any()
-    observations, rewards, *_ = env.step(still(env))
+    # An action of the species that is gone is ignored.
+    observations, rewards, *_ = env.step(still(env) | {"species_1": np.ones((14, 18))})
     assert list(observations) == ["species_0", "species_2"]
     # That neighbours vanished is no merit and no fault.
     assert rewards == {"species_0": 0.0, "species_2": 0.0}
-    everyone = dict.fromkeys(env.possible_agents, np.zeros((14, 18)))
-    refused("got one for species_1: agents that ended", env.step, everyone)
+    refused("got one for species_3: see", env.step, still(env) | {"species_3": np.zeros((14, 18))})
     env.reset()
     assert env.agents == ["species_0", "species_1", "species_2"]
     assert env.particles()[0].shape == (41, 2)
@@ -101,7 +102,7 @@ def test_a_species_ends_when_all_of_its_particles_have_left():
         action[:, 0] = 1.0
     _, _, terminations, _, infos = env.step(actions)
     assert terminations == {"species_0": False, "species_1": True}
-    assert infos["species_1"]["reason"] == "left the world"
+    assert REASONS[infos["species_1"]["reason"]] == "left the world"
     x, _ = env.particles()
     torch.testing.assert_close(x, torch.tensor([[0.7, 0.0], [0.15, 0.0]]))
 
@@ -116,7 +117,8 @@ def test_an_invasion_is_over_when_one_side_is_gone(dead, opponent):
     assert terminations == dict.fromkeys(env.possible_agents, True)
     for agent in env.possible_agents:
         is_dead = agent == f"species_{dead}"
-        assert infos[agent]["reason"] == ("removed" if is_dead else "no opponent")
+        reason = REASONS[infos[agent]["reason"]]
+        assert reason == ("removed" if is_dead else "no opponent")
     assert rewards["species_0"] != 0.0
     assert opponent or rewards["species_0"] == -rewards["species_1"]
     assert env.agents == []
@@ -259,12 +261,11 @@ def test_a_particle_that_leaves_ends_alone():
     actions["particle_1"][0] = 1.0
     observations, _, terminations, _, infos = env.step(actions)
     assert terminations == {"particle_0": False, "particle_1": True, "particle_2": False}
-    assert infos["particle_1"]["reason"] == "left the world"
+    assert REASONS[infos["particle_1"]["reason"]] == "left the world"
     assert set(observations) == set(terminations)
     assert env.agents == ["particle_0", "particle_2"]
     assert env.state()[:, -1].tolist() == [1.0, 0.0, 1.0]
-    refused("got one for particle_1: agents that ended", env.step, actions)
-    observations, *_ = env.step(still(env))
+    observations, *_ = env.step(actions)
     assert set(observations) == {"particle_0", "particle_2"}
 
 

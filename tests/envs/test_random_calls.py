@@ -23,6 +23,7 @@ from support.small_envs import small as small_keywords
 
 from npa_envs import DivergedError, NPAError
 from npa_envs.envs import multispecies_v0, particles_v0
+from npa_envs.envs.multi import AGENT_REASONS
 
 QUICK, THOROUGH = 30, 10_000
 """Calls of each environment."""
@@ -328,7 +329,7 @@ class Crowd(Played):
             assert type(rewards[agent]) is float
             assert np.isfinite(rewards[agent])
             assert late[agent] is is_last
-            reason = infos[agent].get("reason")
+            reason = AGENT_REASONS[infos[agent]["reason"]]
             expected = words if ended[agent] else {"time limit" if is_last else None}
             assert reason in expected
             loss = checked_loss(infos[agent])

@@ -8,6 +8,7 @@ from support.refusals import refused
 
 from npa_envs.envs import multispecies_v0
 from npa_envs.envs.core import world_state
+from npa_envs.envs.multi import AGENT_REASONS
 from npa_envs.errors import NPAError
 
 # Species leave, run out of bounds in their states, are removed, and are cut off.
@@ -30,6 +31,10 @@ def batch(task="mixing", world_count=3, autoreset_mode="same-step", **keywords):
 
 def assert_info_equal(infos, agent, k, info):
     for name, value in info.items():
+        if name not in infos[agent]:
+            assert not value, name
+            continue
+        value = AGENT_REASONS[value] if name == "reason" else value
         got = infos[agent][name]
         got = got if name == "species" else got[k]
         assert got == (np.float32(value) if isinstance(value, float) else value), name
@@ -78,7 +83,7 @@ def test_a_batch_equals_single_environments_while_species_die_here_and_there(tas
                 assert terminations[agent][k] == ended[agent]
                 assert truncations[agent][k] == cut[agent]
                 assert_info_equal(infos, agent, k, info[agent])
-                reasons.add(info[agent].get("reason"))
+                reasons.add(AGENT_REASONS[info[agent]["reason"]])
                 last = infos[agent]["final_obs"] if restarted else observations[agent]
                 assert np.array_equal(last[k], seen[agent])
             if restarted:

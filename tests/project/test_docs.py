@@ -193,7 +193,7 @@ def test_the_examples_of_a_page_of_several_species_run(name, capsys):
     few = ", particle_count=40, max_cycles=4)\nobservations"
     names = run_code(f"environments/{name}", (r"(, max_cycles=200)?\)\nobservations", few))
     assert names["env"].agents == []
-    assert names["infos"][names["env"].possible_agents[-1]]["reason"] == "time limit"
+    assert names["infos"][names["env"].possible_agents[-1]]["reason"] == 4
     if name == "MultiSpecies":
         losses = r"\{'species_0': [\d.]+, 'species_1': [\d.]+\}\n"
         assert re.fullmatch(losses, capsys.readouterr().out)
@@ -209,9 +209,8 @@ def test_a_page_names_the_keys_of_info_and_the_parts_of_the_loss(name, task):
     agent = env.possible_agents[0]
     (row,) = [line for line in section(page, "Reward").splitlines() if f"| {task} |" in line]
     parts = re.findall(r"`(\w+)`", row.split(" | ")[-1])
-    assert set(at_reset[agent]) == {"species", "loss", *(f"loss_{part}" for part in parts)}
-    gained = {f"reward_{part}" for part in parts}
-    assert set(at_step[agent]) == set(at_reset[agent]) | gained | {"reason"}
+    named = {f"{kind}_{part}" for kind in ("loss", "reward") for part in parts}
+    assert set(at_reset[agent]) == set(at_step[agent]) == {"species", "loss", "reason", *named}
     assert {"species", "loss", "reason"} <= set(first_cells(section(page, "Info")))
 
 

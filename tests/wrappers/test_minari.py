@@ -61,6 +61,16 @@ def test_a_recorded_episode_is_what_happened_and_can_be_played_again():
     assert (rules.policy()(seen) - done).abs().max() < 1e-5
 
 
+def test_gardens_are_recorded_in_the_shape_of_their_actions():
+    keywords = {"particle_count": 64, "seed_pool": 1, "grow_steps": 4}
+    for shape in ("flat", "brushes"):
+        fields = {"num_envs": 2, "max_episode_steps": 2, **keywords, "action_shape": shape}
+        envs = gymnasium.make_vec("npa/Gardener2DSmall-v0", **fields)
+        for policy in (lambda seen: np.ones((2, 32)), lambda seen: np.ones((2, 16, 2))):
+            (episode, _) = record_episodes(envs, policy, range(2))
+            assert episode.actions.shape == (2, *envs.single_action_space.shape)
+
+
 def test_a_dataset_is_written_whole_or_not_at_all(root):
     problem = heart(episode_steps=2)
     rules = wild_rules(problem)

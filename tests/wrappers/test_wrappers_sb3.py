@@ -59,7 +59,7 @@ def test_rows_are_those_of_the_worlds_in_order(adapter, reward, output):
             continue
         results.append(infos[0]["terminal_observation"])
         copies.append(results[-1].copy())
-        final = vector_infos["final_obs"].reshape(-1, *shapes[0])
+        final = np.stack(vector_infos["final_obs"]).reshape(-1, *shapes[0])
         for row in (0, each - 1, each, 2 * each - 1):
             np.testing.assert_array_equal(infos[row].pop("terminal_observation"), final[row])
             assert infos[row] == {"TimeLimit.truncated": True, "is_success": False}

@@ -39,6 +39,26 @@ def test_specs_are_those_of_what_comes(id, rows):
     assert over.all(dim=0).tolist() == over.any(dim=0).tolist() == [k % 3 == 2 for k in range(7)]
 
 
+@pytest.mark.parametrize("name", ["npa/Shepherd2D-v0", "npa/Gardener2D-v0"])
+def test_worlds_with_brushes_have_their_own_observations_and_no_rows(name):
+    envs = make_vec(name, 2, max_episode_steps=3, **TORCH)
+    env = NPATorchRLEnv(envs)
+    torchrl.check_env_specs(env)
+    env.set_seed(4)
+    rolled = env.rollout(5, break_when_any_done=False)
+    single = make_vec(name, 2, max_episode_steps=3, **TORCH)
+    seen, _ = single.reset(seed=4)
+    for t in range(3):
+        named = seen if isinstance(seen, dict) else {"observation": seen}
+        for key, value in named.items():
+            assert torch.equal(rolled[key][:, t], value)
+        seen, rewards, *_ = single.step(rolled["action"][:, t])
+        assert torch.equal(rolled["next", "reward"][:, t, 0], rewards)
+    refused("rows need an environment that gives", NPATorchRLEnv, envs, rows=True)
+    discrete = make_vec(name, 2, actions="discrete", **TORCH)
+    refused("env must have actions that are numbers", NPATorchRLEnv, discrete)
+
+
 def test_a_rollout_is_what_single_environments_give():
     env = wrapped(2)
     env.set_seed(5)
