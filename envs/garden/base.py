@@ -249,6 +249,5 @@ class GardenEnv(NPAEnv):
 
     ## Vectorized environment
 
-    As in [every environment](Morphogenesis2D.md#vectorized-environment), but on a CPU worlds are
-    stepped one by one: a batch saves no time there.
+    As in [every environment](Morphogenesis2D.md#vectorized-environment).
     """

@@ -18,7 +18,6 @@ from torch.utils._python_dispatch import is_in_torch_dispatch_mode
 
 from npa_envs.ops.launch import RecordedLaunches
 from npa_envs.ops.sort import sorts_at_once
-from npa_envs.rule.folded_network import Network
 from npa_envs.world.capture_cache import LAUNCHED_FIRST, CallGroups
 from npa_envs.world.particles import Particles, combined
 from npa_envs.world.randomness import Randomness
@@ -45,7 +44,7 @@ class _ReplayedStep:
         self.launches = RecordedLaunches()
         stand_in: Any = self
         with self.launches.recording():
-            step = dataclasses.replace(step, network=stand_in)
+            step = dataclasses.replace(step, network=stand_in, world_by_world=False)
             self.after = step.advance(particles, Draws(mask, None))
         self.slots = self.launches.argument_slots(self._updates)
 
@@ -74,12 +73,13 @@ class ReplayedSteps:
         self._steps = there, back
 
     def run(
-        self, network: Network, particles: Particles, masks: Iterable[Tensor | None], every: int
+        self, rule_step: RuleStep, particles: Particles, drawn: Iterable[Draws], every: int
     ) -> list[Particles]:
-        """Step worlds once with each update mask; return copies of them every `every` steps."""
+        """Make a step of `rule_step` with each draw; return copies of worlds every `every` steps.
+        """
         self._buffers[0].copy_(particles)
         trajectory: list[Particles] = []
-        for number, mask in enumerate(masks):
+        for number, (mask, noise, *_) in enumerate(drawn):
             step = self._steps[number % 2]
             count = len(step.rows)
             if self._mask is not None and mask is not None:
@@ -87,8 +87,10 @@ class ReplayedSteps:
                 count = max(int(mask.sum()), 1)
             step.launches.replay(0, step.split, last_count=count)
             # Kept alive until the launch has read it.
-            updates = network(step.rows[:count])
+            updates = rule_step.updates_of(step.rows[:count], mask, len(particles.x))
             step.launches.move(step.slots, updates)
+            if noise is not None:
+                self._buffers[number % 2].x.add_(noise)
             step.launches.replay(step.split)
             if (number + 1) % every == 0:
                 trajectory.append(self._buffers[(number + 1) % 2].map(torch.clone))
@@ -108,7 +110,7 @@ def replay_launches(
 ) -> Particles | None:
     """Run a rollout by replaying recorded launches; None if the caller must launch its steps.
 
-    Only small worlds on a CPU are replayed, without gradients and noise, and not in the first
+    Only small worlds on a CPU are replayed, without gradients, and not in the first
     `LAUNCHED_FIRST` calls with the same shapes and options.
     """
     x, s, *_ = particles
@@ -118,7 +120,6 @@ def replay_launches(
         or x.device.type != "cpu"
         or x.shape[0] * x.shape[1] > MAX_REPLAYED_PARTICLES
         or step.network is None
-        or step.physics.position_noise > 0.0
         or steps == 0
         or not sorts_at_once(*x.shape[:2])
         or type(x) is not Tensor
@@ -138,9 +139,9 @@ def replay_launches(
         with torch.inference_mode(False), torch.no_grad():
             replayed_steps = ReplayedSteps(step, particles)
     try:
-        masks = (draws.mask for draws in step.draw(x, steps, generator))
+        drawn = step.draw(x, steps, generator)
         with torch.autocast("cpu", enabled=False):
-            trajectory = replayed_steps.run(step.network, particles, masks, keep_every or steps)
+            trajectory = replayed_steps.run(step, particles, drawn, keep_every or steps)
     finally:
         group.free.append(replayed_steps)
     return trajectory[0] if keep_every is None else combined(torch.stack, trajectory)

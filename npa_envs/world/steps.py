@@ -173,23 +173,40 @@ class RuleStep(Step):
     """The rule's weights in the form that kernels run; None: the rule runs as its module."""
     physics: Physics
     detach_positions: bool = True
+    world_by_world: bool = False
+    """Whether the network runs for one world after the other, see `updates_of`."""
+
+    def updates_of(self, perception: Tensor, mask: Tensor | None, world_count: int) -> Tensor:
+        """Return the network's updates of all rows, [K, A']; `mask`, [B, N], says whose they are.
+
+        Torch's products on a CPU may depend in the last bit on their number of rows: with
+        `world_by_world` a world has the same updates in every batch.
+        """
+        network = self.network or self.rule
+        if not self.world_by_world or world_count == 1:
+            return network(perception)
+        even = [len(perception) // world_count] * world_count
+        counts = even if mask is None else mask.sum(dim=1).tolist()
+        # Without an active particle there is one row, which no particle reads.
+        counts[-1] += len(perception) - sum(counts)
+        return torch.cat([network(rows) for rows in perception.split(counts)])
 
     def advance(self, particles: Particles, draws: Draws) -> Particles:
         """Return the worlds after one step with these random numbers."""
         x, s, *_ = particles
         mask, physics = draws.mask, self.physics
-        network = self.network or self.rule
         width = self.network.row_width if self.network else self.rule.perception_dim
         total = row_count(mask, x, physics.update_prob)
         too_many = total > MAX_STORED_ROWS and not torch.is_grad_enabled()
         if too_many and not torch.compiler.is_compiling():
+            network = self.network or self.rule
             update, active = updates_in_parts(x, s, physics, mask, network.__call__, total, width)
         else:
             seen_x = x.detach() if self.detach_positions else x
             perception, active = perceive_rows(
                 seen_x, s, physics, mask=mask, row_capacity=total, row_width=width
             )
-            update = network(perception)
+            update = self.updates_of(perception, mask, len(x))
         return _updated(particles, update, active, draws, physics)
 
 

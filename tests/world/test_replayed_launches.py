@@ -49,8 +49,10 @@ def steps_ready():
         {"update_prob": 0.001, "keep_every": 2, "steps": 4},
         {"by_world": True, "dt": 0.5, "steps": 1},
         {"equivariant": True},
+        {"position_noise": 0.01},
+        {"position_noise": 0.01, "by_world": True, "keep_every": 1},
     ],
-    ids=["open", "box", "few", "by world", "equivariant"],
+    ids=["open", "box", "few", "by world", "equivariant", "noise", "noise by world"],
 )
 def test_replayed_rollouts_are_the_launched_ones(options, dtype):
     options = dict(options)
@@ -100,7 +102,7 @@ def test_worlds_of_inference_mode_are_stepped_too():
     assert_same((ready, run(rule, x, s)), (launched, launched))
 
 
-def test_what_needs_gradients_noise_or_a_rule_of_its_own_is_launched():
+def test_what_needs_gradients_or_a_rule_of_its_own_is_launched():
     class Own(npa_envs.NPARule):
         def forward(self, perception):
             return super().forward(perception)
@@ -109,7 +111,6 @@ def test_what_needs_gradients_noise_or_a_rule_of_its_own_is_launched():
     rule = make_rule()
     own = Own(2, 5, 12, eps0=0.3)
     for _ in range(4):
-        run(rule, x, s, position_noise=0.01)
         run(own, x, s)
         _, after = npa_envs.rollout(rule, x, s, 2)
         assert after.requires_grad
