@@ -146,6 +146,17 @@ class WorldRandom:
         taken.steps = self.steps[worlds].clone()
         return taken
 
+    def take_steps(self, count: int) -> WorldRandom:
+        """Return copies of the streams for each of the next `count` steps, as streams [count B].
+
+        They draw these steps' numbers after `advance`, and then belong into `sync_with`.
+        """
+        taken = copy.copy(self)
+        taken.keys, taken.episodes = self.keys.repeat(count), self.episodes.repeat(count)
+        ahead = torch.arange(count, dtype=self.steps.dtype, device=self.device)
+        taken.steps = (ahead[:, None] + self.steps).flatten()
+        return taken
+
     def substream(self, purpose: int) -> WorldRandom:
         """Return new streams, independent of these and of those of other purposes.
 

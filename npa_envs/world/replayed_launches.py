@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import threading
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from typing import Any
 
 import torch
@@ -20,12 +20,15 @@ from npa_envs.ops.launch import RecordedLaunches
 from npa_envs.ops.sort import sorts_at_once
 from npa_envs.world.capture_cache import LAUNCHED_FIRST, CallGroups
 from npa_envs.world.particles import Particles, combined
-from npa_envs.world.randomness import Randomness
+from npa_envs.world.randomness import Randomness, WorldRandom
 from npa_envs.world.rule_settings import rule_form
 from npa_envs.world.steps import Draws, RuleStep
 
 MAX_REPLAYED_PARTICLES = 4096
 """Maximum number of particles B N; the steps of larger batches take most time in kernels."""
+
+STEPS_DRAWN_TOGETHER = 16
+"""Number of steps whose random numbers are drawn by one launch of each kind."""
 
 MAX_REPLAYED_GROUPS = 32
 """Maximum number of groups of calls whose launches are kept."""
@@ -97,6 +100,25 @@ class ReplayedSteps:
         return trajectory
 
 
+def _draws(
+    step: RuleStep, x: Tensor, steps: int, generator: Randomness | None
+) -> Iterator[Draws]:
+    """Yield what `step.draw` yields; streams of worlds are drawn for several steps at once."""
+    if not isinstance(generator, WorldRandom):
+        yield from step.draw(x, steps, generator)
+        return
+    for first in range(0, steps, STEPS_DRAWN_TOGETHER):
+        count = min(STEPS_DRAWN_TOGETHER, steps - first)
+        streams = generator.take_steps(count)
+        like = x[:1, :1, :1].expand(count * len(x), *x.shape[1:])
+        drawn = [
+            [None] * count if values is None else values.view(count, len(x), *values.shape[1:])
+            for values in step.draw_step(like, streams)[:2]
+        ]
+        generator.sync_with(streams, count)
+        yield from map(Draws, *drawn)
+
+
 _groups = CallGroups()
 _groups_lock = threading.Lock()
 
@@ -139,7 +161,7 @@ def replay_launches(
         with torch.inference_mode(False), torch.no_grad():
             replayed_steps = ReplayedSteps(step, particles)
     try:
-        drawn = step.draw(x, steps, generator)
+        drawn = _draws(step, x, steps, generator)
         with torch.autocast("cpu", enabled=False):
             trajectory = replayed_steps.run(step, particles, drawn, keep_every or steps)
     finally:
