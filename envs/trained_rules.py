@@ -20,6 +20,7 @@ from npa_envs.rule.files import load_rule, shipped_rules
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.targets.digit_clouds import Split
 from npa_envs.world.cuda_graph import makes_plain_tensors
+from npa_envs.world.environment_steps import hold_in_bounds
 from npa_envs.world.particles import Particles, combined
 from npa_envs.world.randomness import StreamId, WorldRandom
 from npa_envs.world.rollout import rollout_particles
@@ -187,13 +188,9 @@ class RuleDrivenWorlds(BatchedWorlds):
         if not bool(torch.isfinite(action).all()):
             raise not_finite(action)
         action = action.to(self.device)
-        diverged = torch.zeros_like(self.diverged, dtype=torch.bool)
-        limits = self.physics.limits.position, self.physics.limits.state
-        for value, new, limit in zip((self.x, self.s), self._stepped(action), limits, strict=True):
-            # NaN is not within any limit.
-            diverged |= ~(new.abs() < limit).flatten(1).all(dim=1)
-            value.copy_(torch.nan_to_num(new, nan=0.0).clamp(-limit, limit))
-        self.diverged.copy_(diverged)
+        x, s = self._stepped(action)
+        self.particles.copy_(Particles(x, s))
+        hold_in_bounds(self.x, self.s, self.physics, self.diverged)
         self.evaluate()
         if self.side_stream is not None:
             self.side_stream.mark()

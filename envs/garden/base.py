@@ -115,7 +115,8 @@ class GardenTask(RuleDrivenTask[Config], GrownTask[Config]):
         """Return worlds after the brushes and the rule's steps, before `disturb`."""
         config = self.config
         run = partial(run_rule, self.rule, config, random=random, detach_positions=False)
-        particles, rate = apply_brushes(particles, action, self.middle(particles.x), config)
+        middle = self.middle(particles.x)
+        particles, rate = apply_brushes(particles, action, middle, config, self.deficit.places)
         if rate is None:
             return run(particles, config.rule_steps)
         box = self.periodic_sides

@@ -157,19 +157,24 @@ def brush_options(config: GardenConfig) -> dict[str, Any]:
 
 
 def apply_brushes(
-    particles: Particles, action: Tensor, middle: Tensor, config: GardenConfig
+    particles: Particles,
+    action: Tensor,
+    middle: Tensor,
+    config: GardenConfig,
+    grid: Tensor | None = None,
 ) -> tuple[Particles, Tensor | None]:
     """Return particles after all brushes at once, whose effects add up, and rates; differentiable.
 
     A rate multiplies a particle's change in each step of the rule, dimensionless, [B, N, 1]; None
     without the tool "rate". `action` has a row for each brush, [B, J, W]; `middle`, [B, 2], is the
-    origin of places.
+    origin of places; `grid`, the result of `grid_places`, saves making it again.
     """
     x, s, *_ = particles
     columns, action = BrushLayout.for_config(config), action.clamp(-1.0, 1.0)
     places = action[..., columns.place]
     if config.actions == "grid":
-        places = grid_places(config, x.device).to(x).expand(len(x), -1, -1)
+        grid = grid_places(config, x.device).to(x) if grid is None else grid
+        places = grid.expand(len(x), -1, -1)
         # Several agents may each have a brush at every place.
         places = places.repeat(1, action.shape[1] // places.shape[1], 1)
     # What all brushes do to a particle is a sum over the brushes near it.

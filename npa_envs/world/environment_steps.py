@@ -22,7 +22,7 @@ from npa_envs.ops.rewards_and_ends import TIME_LIMIT as TIME_LIMIT
 from npa_envs.ops.rewards_and_ends import EpisodeRules as EpisodeRules
 from npa_envs.ops.rewards_and_ends import EpisodeUpdate as EpisodeUpdate
 from npa_envs.ops.species_density import perceive_by_species
-from npa_envs.ops.update import ActedWorlds, PreparedActions
+from npa_envs.ops.update import ActedWorlds, PreparedActions, apply_actions
 from npa_envs.ops.update import wrapped as wrapped
 from npa_envs.ops.world_mean import world_mean as world_mean
 from npa_envs.world.randomness import WorldRandom
@@ -36,6 +36,16 @@ def perceive_each_species(x: Tensor, counts: Sequence[int], physics: Physics) ->
     """
     limit = physics.limits.perception
     return perceive_by_species(x, tuple(counts), physics).clamp(-limit, limit)
+
+
+def hold_in_bounds(x: Tensor, s: Tensor, physics: Physics, diverged: Tensor) -> None:
+    """Clip worlds to `Physics.limits` in place, NaN to 0; `diverged`, uint8 [B]: 1 for changed."""
+    still = physics._replace(moving=False, boundary="open", box=None)
+    nobody = torch.zeros(x.shape[:2], dtype=torch.uint8, device=x.device)
+    # Without an active particle any tensor of the states' shape serves as the action.
+    apply_actions(
+        s, x, s, still, mask=nobody, noise=None, enabled=None, diverged=diverged.zero_()
+    )
 
 
 class Actions(PreparedActions):
