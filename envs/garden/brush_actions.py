@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
@@ -115,6 +116,11 @@ class GardenConfig(GrownConfig):
         rule, hint = f"lie in [{-count}, {count - 1}]", f"there are {count} channels"
         check_field(self, "inject_channels", exist, rule, hint)
 
+    @cached_property
+    def brush_layout(self) -> BrushLayout:
+        """Columns of actions."""
+        return BrushLayout.for_config(self)
+
 
 PUSH_DIRECTIONS = ((1, 0), (1, 1), (0, 1), (-1, 1), (-1, 0), (-1, -1), (0, -1), (1, -1))
 """Directions of pushes of the "discrete" form."""
@@ -170,13 +176,13 @@ def apply_brushes(
     origin of places; `grid`, the result of `grid_places`, saves making it again.
     """
     x, s, *_ = particles
-    columns, action = BrushLayout.for_config(config), action.clamp(-1.0, 1.0)
+    columns, action = config.brush_layout, action.clamp(-1.0, 1.0)
     places = action[..., columns.place]
     if config.actions == "grid":
         grid = grid_places(config, x.device).to(x) if grid is None else grid
-        places = grid.expand(len(x), -1, -1)
         # Several agents may each have a brush at every place.
-        places = places.repeat(1, action.shape[1] // places.shape[1], 1)
+        agents = action.shape[1] // len(grid)
+        places = grid if agents == 1 else grid.repeat(agents, 1)
     # What all brushes do to a particle is a sum over the brushes near it.
     total = sums_under_brushes(x, middle[:, None] + places, action, **brush_options(config))
     if "push" in config.tools:

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from npa_envs.ops.launch import is_aligned, launch
 from npa_envs.ops.perceive import NeighbourState as NeighbourState
 from npa_envs.ops.physics import Boundary as Boundary
 from npa_envs.ops.physics import Limits as Limits
@@ -22,7 +23,7 @@ from npa_envs.ops.rewards_and_ends import TIME_LIMIT as TIME_LIMIT
 from npa_envs.ops.rewards_and_ends import EpisodeRules as EpisodeRules
 from npa_envs.ops.rewards_and_ends import EpisodeUpdate as EpisodeUpdate
 from npa_envs.ops.species_density import perceive_by_species
-from npa_envs.ops.update import ActedWorlds, PreparedActions, apply_actions
+from npa_envs.ops.update import ActedWorlds, PreparedActions
 from npa_envs.ops.update import wrapped as wrapped
 from npa_envs.ops.world_mean import world_mean as world_mean
 from npa_envs.world.randomness import WorldRandom
@@ -42,10 +43,9 @@ def hold_in_bounds(x: Tensor, s: Tensor, physics: Physics, diverged: Tensor) -> 
     """Clip worlds to `Physics.limits` in place, NaN to 0; `diverged`, uint8 [B]: 1 for changed."""
     still = physics._replace(moving=False, boundary="open", box=None)
     nobody = torch.zeros(x.shape[:2], dtype=torch.uint8, device=x.device)
+    worlds = ActedWorlds(x, s, nobody, None, None, diverged.zero_())
     # Without an active particle any tensor of the states' shape serves as the action.
-    apply_actions(
-        s, x, s, still, mask=nobody, noise=None, enabled=None, diverged=diverged.zero_()
-    )
+    launch(*worlds.launch_of(s, still, is_aligned(s)))
 
 
 class Actions(PreparedActions):

@@ -152,7 +152,8 @@ class WorldRandom:
         They draw these steps' numbers after `advance`, and then belong into `sync_with`.
         """
         taken = copy.copy(self)
-        taken.keys, taken.episodes = self.keys.repeat(count), self.episodes.repeat(count)
+        taken.keys = self.keys.expand(count, -1).flatten()
+        taken.episodes = self.episodes.expand(count, -1).flatten()
         ahead = torch.arange(count, dtype=self.steps.dtype, device=self.device)
         taken.steps = (ahead[:, None] + self.steps).flatten()
         return taken

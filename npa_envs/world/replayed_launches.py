@@ -7,6 +7,7 @@ one buffer and writes another; the second does the reverse.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import threading
 from collections.abc import Iterable, Iterator
@@ -22,7 +23,7 @@ from npa_envs.world.capture_cache import LAUNCHED_FIRST, CallGroups
 from npa_envs.world.particles import Particles, combined
 from npa_envs.world.randomness import Randomness, WorldRandom
 from npa_envs.world.rule_settings import rule_form
-from npa_envs.world.steps import Draws, RuleStep
+from npa_envs.world.steps import Draws, RuleStep, active_counts
 
 MAX_REPLAYED_PARTICLES = 4096
 """Maximum number of particles B N; the steps of larger batches take most time in kernels."""
@@ -76,21 +77,26 @@ class ReplayedSteps:
         self._steps = there, back
 
     def run(
-        self, rule_step: RuleStep, particles: Particles, drawn: Iterable[Draws], every: int
+        self,
+        rule_step: RuleStep,
+        particles: Particles,
+        drawn: Iterable[tuple[Draws, list[int]]],
+        every: int,
     ) -> list[Particles]:
-        """Make a step of `rule_step` with each draw; return copies of worlds every `every` steps.
+        """Make a step with each draw; return copies of worlds every `every` steps.
+
+        With a draw come the numbers of active particles of each world.
         """
         self._buffers[0].copy_(particles)
         trajectory: list[Particles] = []
-        for number, (mask, noise, *_) in enumerate(drawn):
+        for number, ((mask, noise, *_), counts) in enumerate(drawn):
             step = self._steps[number % 2]
-            count = len(step.rows)
             if self._mask is not None and mask is not None:
                 self._mask.copy_(mask)
-                count = max(int(mask.sum()), 1)
+            count = max(sum(counts), 1)
             step.launches.replay(0, step.split, last_count=count)
             # Kept alive until the launch has read it.
-            updates = rule_step.updates_of(step.rows[:count], mask, len(particles.x))
+            updates = rule_step.updates_of(step.rows[:count], counts)
             step.launches.move(step.slots, updates)
             if noise is not None:
                 self._buffers[number % 2].x.add_(noise)
@@ -102,21 +108,28 @@ class ReplayedSteps:
 
 def _draws(
     step: RuleStep, x: Tensor, steps: int, generator: Randomness | None
-) -> Iterator[Draws]:
-    """Yield what `step.draw` yields; streams of worlds are drawn for several steps at once."""
+) -> Iterator[tuple[Draws, list[int]]]:
+    """Yield what `step.draw` yields, with numbers of active particles of each world.
+
+    Streams of worlds are drawn for several steps at once.
+    """
     if not isinstance(generator, WorldRandom):
-        yield from step.draw(x, steps, generator)
+        for draws in step.draw(x, steps, generator):
+            yield draws, active_counts(draws.mask, x.shape)
         return
     for first in range(0, steps, STEPS_DRAWN_TOGETHER):
         count = min(STEPS_DRAWN_TOGETHER, steps - first)
         streams = generator.take_steps(count)
         like = x[:1, :1, :1].expand(count * len(x), *x.shape[1:])
+        together = step.draw_step(like, streams)[:2]
         drawn = [
             [None] * count if values is None else values.view(count, len(x), *values.shape[1:])
-            for values in step.draw_step(like, streams)[:2]
+            for values in together
         ]
         generator.sync_with(streams, count)
-        yield from map(Draws, *drawn)
+        counts = active_counts(together[0], like.shape)
+        each = [counts[k : k + len(x)] for k in range(0, len(counts), len(x))]
+        yield from zip(map(Draws, *drawn), each, strict=True)
 
 
 _groups = CallGroups()
@@ -162,7 +175,8 @@ def replay_launches(
             replayed_steps = ReplayedSteps(step, particles)
     try:
         drawn = _draws(step, x, steps, generator)
-        with torch.autocast("cpu", enabled=False):
+        autocast = torch.is_autocast_enabled("cpu")
+        with torch.autocast("cpu", enabled=False) if autocast else contextlib.nullcontext():
             trajectory = replayed_steps.run(step, particles, drawn, keep_every or steps)
     finally:
         group.free.append(replayed_steps)

@@ -63,6 +63,11 @@ def row_count(mask: Tensor | None, x: Tensor, update_prob: float) -> int:
     return row_capacity(total, update_prob) if mask.is_cuda else max(int(mask.sum()), 1)
 
 
+def active_counts(mask: Tensor | None, shape: Sequence[int]) -> list[int]:
+    """Return the numbers of active particles of worlds of `shape`, [B, N, ...], on a CPU."""
+    return [shape[1]] * shape[0] if mask is None else mask.sum(dim=1).tolist()
+
+
 class Draws(NamedTuple):
     """The random numbers of a step, and for static particles the rows that they select."""
 
@@ -176,20 +181,16 @@ class RuleStep(Step):
     world_by_world: bool = False
     """Whether the network runs for one world after the other, see `updates_of`."""
 
-    def updates_of(self, perception: Tensor, mask: Tensor | None, world_count: int) -> Tensor:
-        """Return the network's updates of all rows, [K, A']; `mask`, [B, N], says whose they are.
+    def updates_of(self, perception: Tensor, counts: Sequence[int]) -> Tensor:
+        """Return the network's updates of all rows, [K, A']; world k has `counts[k]` of them.
 
         Torch's products on a CPU may depend in the last bit on their number of rows: with
         `world_by_world` a world has the same updates in every batch.
         """
         network = self.network or self.rule
-        if not self.world_by_world or world_count == 1:
+        if not self.world_by_world or len(counts) == 1 or sum(counts) == 0:
             return network(perception)
-        even = [len(perception) // world_count] * world_count
-        counts = even if mask is None else mask.sum(dim=1).tolist()
-        # Without an active particle there is one row, which no particle reads.
-        counts[-1] += len(perception) - sum(counts)
-        return torch.cat([network(rows) for rows in perception.split(counts)])
+        return torch.cat([network(rows) for rows in perception.split([*counts])])
 
     def advance(self, particles: Particles, draws: Draws) -> Particles:
         """Return the worlds after one step with these random numbers."""
@@ -206,7 +207,8 @@ class RuleStep(Step):
             perception, active = perceive_rows(
                 seen_x, s, physics, mask=mask, row_capacity=total, row_width=width
             )
-            update = self.updates_of(perception, mask, len(x))
+            counts = active_counts(mask, x.shape) if self.world_by_world else ()
+            update = self.updates_of(perception, counts)
         return _updated(particles, update, active, draws, physics)
 
 

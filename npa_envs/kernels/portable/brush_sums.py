@@ -40,13 +40,14 @@ def brush_kernel(scalar: type, width: int, moments: bool) -> wp.Kernel:
         world, j = wp.tid()
         world += range_start
         centre = centres[world, j]
+        inverse_radius = scalar(1.0) / radius
         total = sums_type()
         for i in range(points.shape[1]):
             away = points[world, i] - centre
             if box[0] > scalar(0.0):
                 for d in range(2):
                     away[d] -= box[d] * wp.round(away[d] / box[d])
-            away /= radius
+            away *= inverse_radius
             square = wp.dot(away, away)
             if square < scalar(1.0):
                 weight = wp.float64((scalar(1.0) - square) * (scalar(1.0) - square))
