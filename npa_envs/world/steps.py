@@ -188,9 +188,10 @@ class RuleStep(Step):
         `world_by_world` a world has the same updates in every batch.
         """
         network = self.network or self.rule
-        if not self.world_by_world or len(counts) == 1 or sum(counts) == 0:
+        filled = [count for count in counts if count > 0]
+        if not self.world_by_world or len(filled) < 2:
             return network(perception)
-        return torch.cat([network(rows) for rows in perception.split([*counts])])
+        return torch.cat([network(rows) for rows in perception.split(filled)])
 
     def advance(self, particles: Particles, draws: Draws) -> Particles:
         """Return the worlds after one step with these random numbers."""
