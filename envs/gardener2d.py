@@ -13,7 +13,7 @@ from npa_envs.envs.core.vector import vector_class
 from npa_envs.envs.garden.base import GardenEnv, GardenTask, StartLosses
 from npa_envs.envs.garden.brush_actions import GardenConfig
 from npa_envs.tasks.damage import random_particle
-from npa_envs.world.brushes import push, wipe_state
+from npa_envs.world.brushes import sums_under_brushes, wipe_state
 from npa_envs.world.particles import Particles
 from npa_envs.world.randomness import StreamId, WorldRandom
 
@@ -66,7 +66,9 @@ class GardenerTask(GardenTask[Gardener2DEnvConfig]):
         happens = (chance[:, :1] < config.gust_chance).to(x.dtype)
         move = config.gust_length * happens * torch.cat((angle.cos(), angle.sin()), dim=1)
         box = self.periodic_sides
-        x = push(x, centre=centre, move=move, radius=config.gust_radius, box=box)
+        # As `push`, by one launch.
+        gust = centre[:, None], move[:, None]
+        x = x + sums_under_brushes(x, *gust, radius=config.gust_radius, box=box)
         # A negative radius wipes nothing.
         centre = random_particle(x, random)
         radius = torch.where(chance[:, 1] < config.blight_chance, config.blight_radius, -1.0)

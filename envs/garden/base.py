@@ -19,14 +19,13 @@ from npa_envs.envs.garden.brush_actions import (
     BrushSpaces,
     GardenConfig,
     apply_brushes,
-    brush_weights,
+    brush_options,
     grid_places,
-    offsets,
 )
 from npa_envs.envs.trained_rules import GrownTask, RuleDrivenTask, check_matches_rule, run_rule
 from npa_envs.rule.rule import COLOUR_OFFSET
 from npa_envs.tasks.targets.picture_points import PointTarget
-from npa_envs.world.brushes import nearest_image
+from npa_envs.world.brushes import nearest_image, sums_under_brushes
 from npa_envs.world.particles import Particles
 from npa_envs.world.randomness import WorldRandom
 
@@ -63,14 +62,9 @@ class TargetDeficit:
         return self._target_sums - self._weighted(particles, middle)
 
     def _weighted(self, particles: Particles, middle: Tensor) -> Tensor:
-        x = particles.x
-        away = offsets(x, middle[:, None] + self.places, self._config)
-        sides = away / self._config.brush_radius
-        colours = particles.s[:, None, :, -3:].expand(-1, len(self.places), -1, -1)
-        values = torch.cat((torch.ones_like(sides[..., :1]), sides, colours), dim=-1)
-        values = values * brush_weights(away, self._config)[..., None]
-        mean = world_mean(values.transpose(1, 2).flatten(2))
-        return self._scale * mean.view(len(x), len(self.places), VALUES_PER_PLACE)
+        x, colours, places = particles.x, particles.s[..., -3:], middle[:, None] + self.places
+        sums = sums_under_brushes(places, x, colours, moments=True, **brush_options(self._config))
+        return self._scale / x.shape[1] * sums
 
 
 def coarse(pictures: Tensor, size: int) -> Tensor:
@@ -99,6 +93,7 @@ class GardenTask(RuleDrivenTask[Config], GrownTask[Config]):
         super().__init__(config, device)
         check_matches_rule(self.rule, config, "alpha", "eps0", "moment_inverse")
         self.rule.requires_grad_(False)
+        self._target_middle = self.task.target.points.mean(dim=0)
         self.deficit = TargetDeficit(grid_places(config, device), self.task.target, config)
         """Difference between the target and worlds at the places of the grid."""
 
@@ -125,7 +120,8 @@ class GardenTask(RuleDrivenTask[Config], GrownTask[Config]):
         """Return worlds after the brushes and the rule's steps, before `disturb`."""
         config = self.config
         run = partial(run_rule, self.rule, config, random=random, detach_positions=False)
-        particles, rate = apply_brushes(particles, action, self.middle(particles.x), config)
+        middle = self.middle(particles.x)
+        particles, rate = apply_brushes(particles, action, middle, config, self.deficit.places)
         if rate is None:
             return run(particles, config.rule_steps)
         box = self.periodic_sides
@@ -153,7 +149,7 @@ class GardenTask(RuleDrivenTask[Config], GrownTask[Config]):
 
     def middle(self, x: Tensor) -> Tensor:
         """Return the origin of the places: particles' mean position minus the target's, [B, 2]."""
-        return world_mean(x) - self.task.target.points.mean(dim=0)
+        return world_mean(x) - self._target_middle
 
     def observe(self, particles: Particles, loss: Tensor, context: Any) -> Tensor:
         """Return observations [B, O] in the form of `config.observe`: grid, moments or picture."""
@@ -260,6 +256,5 @@ class GardenEnv(NPAEnv):
 
     ## Vectorized environment
 
-    As in [every environment](Morphogenesis2D.md#vectorized-environment), but on a CPU worlds are
-    stepped one by one: a batch saves no time there.
+    As in [every environment](Morphogenesis2D.md#vectorized-environment).
     """

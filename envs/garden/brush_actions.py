@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
@@ -10,13 +11,12 @@ import torch
 from gymnasium.spaces import Box, MultiDiscrete, Space
 from torch import Tensor
 
-from npa_envs import world_mean
 from npa_envs.checks import check_field, check_flag, check_positive, is_whole
 from npa_envs.envs.core.base import ParticleSpaces, batch_tensor
 from npa_envs.envs.core.config import check_picture_size
 from npa_envs.envs.trained_rules import OF_PARTICLES, GrownConfig
 from npa_envs.errors import NPAError, shown
-from npa_envs.world.brushes import offsets_from, softness
+from npa_envs.world.brushes import sums_under_brushes
 from npa_envs.world.environment_steps import Physics
 from npa_envs.world.particles import Particles
 
@@ -122,6 +122,11 @@ class GardenConfig(GrownConfig):
         rule, hint = f"lie in [{-count}, {count - 1}]", f"there are {count} channels"
         check_field(self, "inject_channels", exist, rule, hint)
 
+    @cached_property
+    def brush_layout(self) -> BrushLayout:
+        """Columns of actions."""
+        return BrushLayout.for_config(self)
+
 
 PUSH_DIRECTIONS = ((1, 0), (1, 1), (0, 1), (-1, 1), (-1, 0), (-1, -1), (0, -1), (1, -1))
 """Directions of pushes of the "discrete" form."""
@@ -157,40 +162,35 @@ def grid_places(config: GardenConfig, device: torch.device | None = None) -> Ten
     return torch.stack((across.flatten(), up.flatten()), dim=-1)
 
 
-def offsets(x: Tensor, places: Tensor, config: GardenConfig) -> Tensor:
-    """Return the vectors from `places`, [B, J, 2], to `x`, [B, N, 2], shape [B, J, N, 2]."""
-    spread = x[:, None].expand(-1, places.shape[1], -1, -1)
+def brush_options(config: GardenConfig) -> dict[str, Any]:
+    """Return radius and box of brushes, as `sums_under_brushes` takes them."""
     box = None if config.periodic_box is None else (config.periodic_box, config.periodic_box)
-    return offsets_from(spread.flatten(0, 1), places.flatten(0, 1), box).view(spread.shape)
-
-
-def brush_weights(away: Tensor, config: GardenConfig) -> Tensor:
-    """Return each brush's weight in [0, 1], [B, J, N], at offsets `away`, [B, J, N, 2]."""
-    origin = away.new_zeros(away.shape[0] * away.shape[1], 2)
-    weights = softness(away.flatten(0, 1), centre=origin, radius=config.brush_radius)
-    return weights.view(away.shape[:3])
+    return {"radius": config.brush_radius, "box": box}
 
 
 def apply_brushes(
-    particles: Particles, action: Tensor, middle: Tensor, config: GardenConfig
+    particles: Particles,
+    action: Tensor,
+    middle: Tensor,
+    config: GardenConfig,
+    grid: Tensor | None = None,
 ) -> tuple[Particles, Tensor | None]:
     """Return particles after all brushes at once, whose effects add up, and rates; differentiable.
 
     A rate multiplies a particle's change in each step of the rule, dimensionless, [B, N, 1]; None
     without the tool "rate". `action` has a row for each brush, [B, J, W]; `middle`, [B, 2], is the
-    origin of places.
+    origin of places; `grid`, the result of `grid_places`, saves making it again.
     """
     x, s, *_ = particles
-    columns, action = BrushLayout.for_config(config), action.clamp(-1.0, 1.0)
+    columns, action = config.brush_layout, action.clamp(-1.0, 1.0)
     places = action[..., columns.place]
     if config.actions == "grid":
-        places = grid_places(config, x.device).to(x)
+        grid = grid_places(config, x.device).to(x) if grid is None else grid
         # Several agents may each have a brush at every place.
-        places = places.repeat(action.shape[1] // len(places), 1)
-    weights = brush_weights(offsets(x, middle[:, None] + places, config), config)
-    doses = weights[..., None] * action[:, :, None]
-    # Torch's own sums may change in the last bit with the number of worlds.
-    total = len(doses[0]) * world_mean(doses.flatten(2)).view(*x.shape[:2], columns.width)
+        agents = action.shape[1] // len(grid)
+        places = grid if agents == 1 else grid.repeat(agents, 1)
+    # What all brushes do to a particle is a sum over the brushes near it.
+    total = sums_under_brushes(x, middle[:, None] + places, action, **brush_options(config))
     if "push" in config.tools:
         x = x + config.push_length * total[..., columns.push]
     if "wipe" in config.tools:

@@ -157,6 +157,9 @@ def _prepare(
 loaded_modules: set[tuple[Any, torch.device]] = set()
 """Modules of kernels that have been loaded, each with its device."""
 
+MAX_DESCRIPTORS = 64
+"""Maximum number of shapes whose descriptors are cached for an argument of a kernel."""
+
 MAX_BOUNDS = 4096
 """Maximum number of launch sizes whose structs are cached for a kernel."""
 
@@ -290,6 +293,8 @@ class _ArrayArgument:
         self._size: tuple[int, ...] | None = None
         """Shape of the described tensor; (): describe the next one again; None: it is absent."""
         self._dtype: torch.dtype | None = None
+        self._dense: dict[tuple[Any, Any], Any] = {}
+        """Descriptors of contiguous tensors by shape and dtype."""
 
     def set(self, tensor: Tensor | None) -> None:
         """Write a tensor's address, and its shape if that changed; None: an absent array."""
@@ -301,7 +306,12 @@ class _ArrayArgument:
             return
         size, dense = tensor.shape, tensor.is_contiguous()
         if size != self._size or tensor.dtype is not self._dtype or not dense:
-            _overwrite(self._descriptor, _array_descriptor(tensor, self._type))
+            described = self._dense.get((size, tensor.dtype)) if dense else None
+            if described is None:
+                described = _array_descriptor(tensor, self._type)
+                if dense and len(self._dense) < MAX_DESCRIPTORS:
+                    self._dense[size, tensor.dtype] = described
+            _overwrite(self._descriptor, described)
             self._size, self._dtype = size if dense else (), tensor.dtype
         self._descriptor.data = tensor.data_ptr() or _empty_address(tensor)
 
@@ -317,7 +327,7 @@ def _empty_address(tensor: Tensor) -> int:
 
 
 def _overwrite(memory: Any, value: Any) -> None:
-    ctypes.memmove(ctypes.addressof(memory), ctypes.addressof(value), ctypes.sizeof(value))
+    ctypes.memmove(ctypes.byref(memory), ctypes.byref(value), ctypes.sizeof(value))
 
 
 def _array_descriptor(tensor: Tensor, array_type: Any) -> Any:

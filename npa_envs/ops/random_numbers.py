@@ -5,12 +5,25 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from npa_envs.kernels.portable.random_numbers import draw_kernel
+from npa_envs.kernels.portable.random_numbers import GOLDEN, draw_kernel, mix_keys
 from npa_envs.ops.custom_op import custom_op
 from npa_envs.ops.launch import SCALARS, launch
 
 WORD_COUNT = 2**32
 """Number of values of one 32-bit output of the generator."""
+
+
+@custom_op("npa::mix_keys")
+def _mix_keys(keys: Tensor, advance: int) -> Tensor:
+    mixed = torch.empty_like(keys)
+    launch(mix_keys, keys.shape[0], keys.device, advance, keys, mixed)
+    return mixed
+
+
+def mixed_keys(keys: Tensor, number: int) -> Tensor:
+    """Return the 64 bits at index `number` of each key's SplitMix64 sequence, int64, shape [B]."""
+    # The lowest 64 bits as a signed integer, as in torch.
+    return _mix_keys(keys, ((number + 1) * GOLDEN + 2**63) % 2**64 - 2**63)
 
 
 @custom_op("npa::draw")

@@ -87,6 +87,8 @@ def world_mean(values: Tensor) -> Tensor:
             f"got {tuple(values.shape)}: reshape it"
         )
     check_derivatives(values=values)
+    if not (torch.is_grad_enabled() and values.requires_grad):
+        return _world_mean(values)
     means: Tensor = _WorldMean.apply(values)  # type: ignore[no-untyped-call]
     return means
 

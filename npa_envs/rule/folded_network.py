@@ -93,7 +93,7 @@ class FoldedRule(NamedTuple):
         elif torch.is_grad_enabled():
             update = _TwoLayers.apply(rows, self.hidden_weight, self.output_weight)  # type: ignore[no-untyped-call]
         else:
-            hidden = torch.relu(rows @ self.hidden_weight.T)
+            hidden = torch.relu_(rows @ self.hidden_weight.T)
             update = _blocked_product(hidden, self.output_weight)
         return without_small(update, self.dead_zone)
 

@@ -18,6 +18,8 @@ from torch import Tensor
 
 from npa_envs.checks import as_list, check_alike, check_world, checked_number
 from npa_envs.errors import NPAError, shown
+from npa_envs.ops.brush_sums import brush_sums
+from npa_envs.ops.world_mean import world_mean
 
 Sides = tuple[float, ...] | None
 
@@ -56,6 +58,38 @@ def softness(x: Tensor, *, centre: Tensor, radius: float | Tensor, box: Sides = 
     # Masked before the division: with a radius of zero weights are 0 and not NaN.
     square = square / torch.where(size > 0, size, torch.ones_like(size)).square()
     return torch.where(size > 0, (1.0 - square).clamp_min(0.0), 0.0).square()
+
+
+def sums_under_brushes(
+    centres: Tensor,
+    points: Tensor,
+    values: Tensor,
+    *,
+    radius: float,
+    box: Sides = None,
+    moments: bool = False,
+) -> Tensor:
+    """Return sums over points of their values, weighted by `softness` of each brush, [B, J, W].
+
+    A world's sums are the same in every batch, bit for bit. In 2D.
+
+    Args:
+        centres: Centres of J brushes [length units], shape [B, J, 2].
+        points: I points, or particles [length units], shape [B, I, 2].
+        values: Values of the points, shape [B, I, W].
+        radius: Radius of all brushes [length units].
+        moments: The sums of 1 and of offsets from the centre, in radii, come first: [B, J, 3 + W].
+    """
+    tensors = centres, points, values
+    if not (torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors)):
+        return brush_sums(*tensors, radius, [*(box or (0.0, 0.0))], moments)
+    away = nearest_image(points[:, None] - centres[:, :, None], box) / radius
+    weights = (1.0 - away.square().sum(dim=-1, keepdim=True)).clamp_min(0.0).square()
+    terms = values[:, None].expand(-1, centres.shape[1], -1, -1)
+    if moments:
+        terms = torch.cat((torch.ones_like(weights), away, terms), dim=-1)
+    sums = points.shape[1] * world_mean((weights * terms).transpose(1, 2).flatten(2))
+    return sums.view(*centres.shape[:2], -1)
 
 
 def push(

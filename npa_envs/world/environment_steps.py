@@ -10,6 +10,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from npa_envs.ops.launch import is_aligned, launch
 from npa_envs.ops.perceive import NeighbourState as NeighbourState
 from npa_envs.ops.physics import Boundary as Boundary
 from npa_envs.ops.physics import Limits as Limits
@@ -36,6 +37,15 @@ def perceive_each_species(x: Tensor, counts: Sequence[int], physics: Physics) ->
     """
     limit = physics.limits.perception
     return perceive_by_species(x, tuple(counts), physics).clamp(-limit, limit)
+
+
+def hold_in_bounds(x: Tensor, s: Tensor, physics: Physics, diverged: Tensor) -> None:
+    """Clip worlds to `Physics.limits` in place, NaN to 0; `diverged`, uint8 [B]: 1 for changed."""
+    still = physics._replace(moving=False, boundary="open", box=None)
+    nobody = torch.zeros(x.shape[:2], dtype=torch.uint8, device=x.device)
+    worlds = ActedWorlds(x, s, nobody, None, None, diverged.zero_())
+    # Without an active particle any tensor of the states' shape serves as the action.
+    launch(*worlds.launch_of(s, still, is_aligned(s)))
 
 
 class Actions(PreparedActions):

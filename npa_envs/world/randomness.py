@@ -15,7 +15,7 @@ from torch import Tensor
 
 from npa_envs.checks import DTYPES, check_dense, check_device, checked_count, checked_number
 from npa_envs.errors import NPAError, shown
-from npa_envs.ops.random_numbers import WORD_COUNT, draw
+from npa_envs.ops.random_numbers import WORD_COUNT, draw, mixed_keys
 from npa_envs.ops.sort import MAX_INDEX
 
 
@@ -146,6 +146,18 @@ class WorldRandom:
         taken.steps = self.steps[worlds].clone()
         return taken
 
+    def take_steps(self, count: int) -> WorldRandom:
+        """Return copies of the streams for each of the next `count` steps, as streams [count B].
+
+        They draw these steps' numbers after `advance`, and then belong into `sync_with`.
+        """
+        taken = copy.copy(self)
+        taken.keys = self.keys.expand(count, -1).flatten()
+        taken.episodes = self.episodes.expand(count, -1).flatten()
+        ahead = torch.arange(count, dtype=self.steps.dtype, device=self.device)
+        taken.steps = (ahead[:, None] + self.steps).flatten()
+        return taken
+
     def substream(self, purpose: int) -> WorldRandom:
         """Return new streams, independent of these and of those of other purposes.
 
@@ -158,8 +170,9 @@ class WorldRandom:
         Raises:
             NPAError: `purpose` is not an integer of at least 0.
         """
-        streams = self.take(slice(None))
-        streams.keys = _mixed(self.keys, checked_count("purpose", purpose))
+        streams = type(self).__new__(type(self))
+        streams.keys = mixed_keys(self.keys, checked_count("purpose", purpose))
+        streams.episodes, streams.steps = self.episodes.clone(), self.steps.clone()
         streams._draw_count = 0
         return streams
 
@@ -311,22 +324,3 @@ def normal_draws(generator: Randomness | None, shape: Sequence[int], like: Tenso
     if isinstance(generator, WorldRandom):
         return generator.normal(*shape[1:], dtype=like.dtype)
     return torch.randn(tuple(shape), generator=generator, device=like.device, dtype=like.dtype)
-
-
-GOLDEN = 0x9E3779B97F4A7C15
-MIXERS = ((30, 0xBF58476D1CE4E5B9), (27, 0x94D049BB133111EB), (31, 1))
-
-
-def _mixed(keys: Tensor, number: int) -> Tensor:
-    """Return the 64 bits at index `number` of each key's SplitMix64 sequence, int64, shape [B]."""
-    # Steele, Lea and Flood, "Fast splittable pseudorandom number generators" (OOPSLA 2014).
-    bits = keys + _signed((number + 1) * GOLDEN)
-    for shift, factor in MIXERS:
-        # Torch's shift copies the sign bit; the mask removes the copies.
-        bits = (bits ^ ((bits >> shift) & (2 ** (64 - shift) - 1))) * _signed(factor)
-    return bits
-
-
-def _signed(number: int) -> int:
-    """Return the lowest 64 bits of a number as a signed integer, as in torch."""
-    return (number + 2**63) % 2**64 - 2**63

@@ -7,9 +7,10 @@ one buffer and writes another; the second does the reverse.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import threading
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from typing import Any
 
 import torch
@@ -18,15 +19,17 @@ from torch.utils._python_dispatch import is_in_torch_dispatch_mode
 
 from npa_envs.ops.launch import RecordedLaunches
 from npa_envs.ops.sort import sorts_at_once
-from npa_envs.rule.folded_network import Network
 from npa_envs.world.capture_cache import LAUNCHED_FIRST, CallGroups
 from npa_envs.world.particles import Particles, combined
-from npa_envs.world.randomness import Randomness
+from npa_envs.world.randomness import Randomness, WorldRandom
 from npa_envs.world.rule_settings import rule_form
-from npa_envs.world.steps import Draws, RuleStep
+from npa_envs.world.steps import Draws, RuleStep, active_counts
 
 MAX_REPLAYED_PARTICLES = 4096
 """Maximum number of particles B N; the steps of larger batches take most time in kernels."""
+
+STEPS_DRAWN_TOGETHER = 16
+"""Number of steps whose random numbers are drawn by one launch of each kind."""
 
 MAX_REPLAYED_GROUPS = 32
 """Maximum number of groups of calls whose launches are kept."""
@@ -45,7 +48,7 @@ class _ReplayedStep:
         self.launches = RecordedLaunches()
         stand_in: Any = self
         with self.launches.recording():
-            step = dataclasses.replace(step, network=stand_in)
+            step = dataclasses.replace(step, network=stand_in, world_by_world=False)
             self.after = step.advance(particles, Draws(mask, None))
         self.slots = self.launches.argument_slots(self._updates)
 
@@ -74,25 +77,59 @@ class ReplayedSteps:
         self._steps = there, back
 
     def run(
-        self, network: Network, particles: Particles, masks: Iterable[Tensor | None], every: int
+        self,
+        rule_step: RuleStep,
+        particles: Particles,
+        drawn: Iterable[tuple[Draws, list[int]]],
+        every: int,
     ) -> list[Particles]:
-        """Step worlds once with each update mask; return copies of them every `every` steps."""
+        """Make a step with each draw; return copies of worlds every `every` steps.
+
+        With a draw come the numbers of active particles of each world.
+        """
         self._buffers[0].copy_(particles)
         trajectory: list[Particles] = []
-        for number, mask in enumerate(masks):
+        for number, ((mask, noise, *_), counts) in enumerate(drawn):
             step = self._steps[number % 2]
-            count = len(step.rows)
             if self._mask is not None and mask is not None:
                 self._mask.copy_(mask)
-                count = max(int(mask.sum()), 1)
+            count = max(sum(counts), 1)
             step.launches.replay(0, step.split, last_count=count)
             # Kept alive until the launch has read it.
-            updates = network(step.rows[:count])
+            updates = rule_step.updates_of(step.rows[:count], counts)
             step.launches.move(step.slots, updates)
+            if noise is not None:
+                self._buffers[number % 2].x.add_(noise)
             step.launches.replay(step.split)
             if (number + 1) % every == 0:
                 trajectory.append(self._buffers[(number + 1) % 2].map(torch.clone))
         return trajectory
+
+
+def _draws(
+    step: RuleStep, x: Tensor, steps: int, generator: Randomness | None
+) -> Iterator[tuple[Draws, list[int]]]:
+    """Yield what `step.draw` yields, with numbers of active particles of each world.
+
+    Streams of worlds are drawn for several steps at once.
+    """
+    if not isinstance(generator, WorldRandom):
+        for draws in step.draw(x, steps, generator):
+            yield draws, active_counts(draws.mask, x.shape)
+        return
+    for first in range(0, steps, STEPS_DRAWN_TOGETHER):
+        count = min(STEPS_DRAWN_TOGETHER, steps - first)
+        streams = generator.take_steps(count)
+        like = x[:1, :1, :1].expand(count * len(x), *x.shape[1:])
+        together = step.draw_step(like, streams)[:2]
+        drawn = [
+            [None] * count if values is None else values.view(count, len(x), *values.shape[1:])
+            for values in together
+        ]
+        generator.sync_with(streams, count)
+        counts = active_counts(together[0], like.shape)
+        each = [counts[k : k + len(x)] for k in range(0, len(counts), len(x))]
+        yield from zip(map(Draws, *drawn), each, strict=True)
 
 
 _groups = CallGroups()
@@ -108,7 +145,7 @@ def replay_launches(
 ) -> Particles | None:
     """Run a rollout by replaying recorded launches; None if the caller must launch its steps.
 
-    Only small worlds on a CPU are replayed, without gradients and noise, and not in the first
+    Only small worlds on a CPU are replayed, without gradients, and not in the first
     `LAUNCHED_FIRST` calls with the same shapes and options.
     """
     x, s, *_ = particles
@@ -118,7 +155,6 @@ def replay_launches(
         or x.device.type != "cpu"
         or x.shape[0] * x.shape[1] > MAX_REPLAYED_PARTICLES
         or step.network is None
-        or step.physics.position_noise > 0.0
         or steps == 0
         or not sorts_at_once(*x.shape[:2])
         or type(x) is not Tensor
@@ -138,9 +174,10 @@ def replay_launches(
         with torch.inference_mode(False), torch.no_grad():
             replayed_steps = ReplayedSteps(step, particles)
     try:
-        masks = (draws.mask for draws in step.draw(x, steps, generator))
-        with torch.autocast("cpu", enabled=False):
-            trajectory = replayed_steps.run(step.network, particles, masks, keep_every or steps)
+        drawn = _draws(step, x, steps, generator)
+        autocast = torch.is_autocast_enabled("cpu")
+        with torch.autocast("cpu", enabled=False) if autocast else contextlib.nullcontext():
+            trajectory = replayed_steps.run(step, particles, drawn, keep_every or steps)
     finally:
         group.free.append(replayed_steps)
     return trajectory[0] if keep_every is None else combined(torch.stack, trajectory)

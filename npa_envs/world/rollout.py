@@ -289,6 +289,7 @@ def run_rules(
     species: Sequence[SpeciesSpec] = (),
     *,
     per_species: bool = False,
+    world_by_world: bool = False,
     detach_positions: bool = True,
     memory: Memory = "store",
     generator: Randomness | None = None,
@@ -312,7 +313,14 @@ def run_rules(
     check_generator(generator, worlds.x.device, worlds.x.shape[0])
     after = execute(
         RolloutSpec(
-            steps, constants, detach_positions, memory, keep_every, tuple(species), per_species
+            steps,
+            constants,
+            detach_positions,
+            memory,
+            keep_every,
+            tuple(species),
+            per_species,
+            world_by_world,
         ),
         rules,
         worlds.with_fields(goal=None),

@@ -156,6 +156,8 @@ class RolloutSpec(NamedTuple):
     """The species, if several rules share a world."""
     per_species: bool = False
     """Whether rules perceive each species' density and density gradient."""
+    world_by_world: bool = False
+    """Whether a rule's network runs for one world after the other (`RuleStep.updates_of`)."""
 
     def make_step(self, rules: Sequence[NPARule], particles: Particles) -> Step:
         """Return a new `Step` of the kind that these rules, worlds and options need."""
@@ -169,7 +171,7 @@ class RolloutSpec(NamedTuple):
             return StaticStep(rule, physics, particles.x)
         # A rule with a custom network runs as its module.
         cls = DivisionStep if rule.divides else RuleStep
-        return cls(rule, rule.network(), physics, detach_positions)
+        return cls(rule, rule.network(), physics, detach_positions, self.world_by_world)
 
     def launch(
         self,

@@ -63,6 +63,11 @@ def row_count(mask: Tensor | None, x: Tensor, update_prob: float) -> int:
     return row_capacity(total, update_prob) if mask.is_cuda else max(int(mask.sum()), 1)
 
 
+def active_counts(mask: Tensor | None, shape: Sequence[int]) -> list[int]:
+    """Return the numbers of active particles of worlds of `shape`, [B, N, ...], on a CPU."""
+    return [shape[1]] * shape[0] if mask is None else mask.sum(dim=1).tolist()
+
+
 class Draws(NamedTuple):
     """The random numbers of a step, and for static particles the rows that they select."""
 
@@ -173,23 +178,38 @@ class RuleStep(Step):
     """The rule's weights in the form that kernels run; None: the rule runs as its module."""
     physics: Physics
     detach_positions: bool = True
+    world_by_world: bool = False
+    """Whether the network runs for one world after the other, see `updates_of`."""
+
+    def updates_of(self, perception: Tensor, counts: Sequence[int]) -> Tensor:
+        """Return the network's updates of all rows, [K, A']; world k has `counts[k]` of them.
+
+        Torch's products on a CPU may depend in the last bit on their number of rows: with
+        `world_by_world` a world has the same updates in every batch.
+        """
+        network = self.network or self.rule
+        filled = [count for count in counts if count > 0]
+        if not self.world_by_world or len(filled) < 2:
+            return network(perception)
+        return torch.cat([network(rows) for rows in torch.split(perception, filled)])
 
     def advance(self, particles: Particles, draws: Draws) -> Particles:
         """Return the worlds after one step with these random numbers."""
         x, s, *_ = particles
         mask, physics = draws.mask, self.physics
-        network = self.network or self.rule
         width = self.network.row_width if self.network else self.rule.perception_dim
         total = row_count(mask, x, physics.update_prob)
         too_many = total > MAX_STORED_ROWS and not torch.is_grad_enabled()
         if too_many and not torch.compiler.is_compiling():
+            network = self.network or self.rule
             update, active = updates_in_parts(x, s, physics, mask, network.__call__, total, width)
         else:
             seen_x = x.detach() if self.detach_positions else x
             perception, active = perceive_rows(
                 seen_x, s, physics, mask=mask, row_capacity=total, row_width=width
             )
-            update = network(perception)
+            counts = active_counts(mask, x.shape) if self.world_by_world else ()
+            update = self.updates_of(perception, counts)
         return _updated(particles, update, active, draws, physics)
 
 

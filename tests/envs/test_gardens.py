@@ -14,7 +14,7 @@ from support.small_envs import assert_same, begun, make, make_vec, small
 import npa_envs
 from npa_envs.agents.garden_policies import RandomGardener
 from npa_envs.agents.shapeshifter_policies import RecognisingShapeshifter
-from npa_envs.envs import gardeners_v0
+from npa_envs.envs import gardeners_v0, trained_rules
 from npa_envs.envs.garden.base import StartLosses
 from npa_envs.envs.garden.brush_actions import BrushLayout, apply_brushes, grid_places
 from npa_envs.envs.gardener2d import Gardener2DEnv
@@ -64,6 +64,25 @@ def test_brushes_do_what_the_documentation_says():
     assert torch.equal(dosed[..., :-3], s[..., :-3])
     _, rate = apply_brushes(world, brush(config, rate=-1.0), middle, config)
     assert torch.allclose(rate[0, :, 0], 1.0 - held)
+
+
+@pytest.mark.parametrize("name", [GARDENER, SHEPHERD, "npa/Shapeshifter2D-v0"])
+def test_a_world_is_the_same_alone_and_among_others_that_are_stepped_with_it(name, monkeypatch):
+    count, fields = 5, {"particle_count": 250}
+    # Four worlds together; from the third step on launches are replayed.
+    monkeypatch.setattr(trained_rules, "STEPPED_TOGETHER", 1000)
+    envs = make_vec(name, count, **fields)
+    envs.reset(seed=3)
+    actions = sampled(envs, 5)
+    for action in actions:
+        envs.step(action)
+    x, s = envs.unwrapped.particles()
+    for k in range(count):
+        env = begun(make(name, **fields), seed=3 + k)
+        for action in actions:
+            env.step(action[k])
+        assert torch.equal(env.unwrapped.particles()[0], x[k])
+        assert torch.equal(env.unwrapped.particles()[1], s[k])
 
 
 def test_brushes_stand_on_the_grid_and_what_they_do_adds_up():

@@ -20,10 +20,15 @@ ROOT = HERE.parents[1]
 
 AGENTS = r"(gardeners|species/\w+/(parallel|particles))/steps"
 BATCH_INFOS = "infos of batches are those of SyncVectorEnv"
+GARDENS = "Gardener2D", "Shepherd2D"
 ACCEPTED = {
     "film/gecko/growth-filmstrip.png": "its caption says wipe for erase",
     "healing/heart/healing": "healing is measured near wounds",
     "golden/batch-": "gone: other tests compare batches with single environments",
+    **dict.fromkeys(
+        ("gardeners/", *(f"{form}/npa/{name}" for form in ("env", "batch") for name in GARDENS)),
+        "sums under brushes have a kernel",
+    ),
     "golden/crowd-in-turn": "gone: another test compares turns with acting at once",
     "gardeners/state$": "two gardeners had no state",
     f"{AGENTS}/0/1/.*/(reward_.*|success|diverged)$": "infos have the same names at all times",

@@ -12,6 +12,7 @@ from npa_envs.world.brushes import (
     push,
     softness,
     state_around,
+    sums_under_brushes,
     wipe_state,
 )
 
@@ -59,6 +60,24 @@ def test_push_carries_its_middle_by_its_share_and_nothing_outside():
     # Half-way out the brush holds (1 - 1/4)² of it.
     torch.testing.assert_close(moved[0, 1], 0.5 * 0.5625 * move[0])
     assert torch.equal(moved[0, 2:], torch.zeros(2, 2, dtype=x.dtype))
+
+
+@pytest.mark.parametrize("box", [None, (1.2, 1.2)], ids=["open", "box"])
+@pytest.mark.parametrize("moments", [False, True])
+def test_sums_under_brushes_are_those_of_soft_weights_in_every_batch(moments, box):
+    x, values = worlds(3, 300)
+    centres, options = worlds(3, 7, seed=2)[0], {"radius": 0.5, "box": box, "moments": moments}
+    sums = sums_under_brushes(centres, x, values, **options)
+    with_gradient = sums_under_brushes(centres, x, values.requires_grad_(), **options)
+    torch.testing.assert_close(sums, with_gradient)
+    held = softness(x, centre=centres[:, 3], radius=0.5, box=box)
+    torch.testing.assert_close(sums[:, 3, 3 * moments :], (held * values).sum(dim=1))
+    if moments:
+        torch.testing.assert_close(sums[:, 3, 0], held.sum(dim=(1, 2)))
+    single = [v.detach().float() for v in (centres, x, values)]
+    alone = sums_under_brushes(*(v[1:2] for v in single), **options)
+    assert torch.equal(alone, sums_under_brushes(*single, **options)[1:2])
+    torch.testing.assert_close(alone.double(), sums[1:2], rtol=1e-5, atol=1e-4)
 
 
 def test_a_brush_of_no_size_does_nothing_and_has_a_derivative():

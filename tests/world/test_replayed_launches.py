@@ -8,6 +8,8 @@ from support.worlds import assert_same, lively_rule, random_world
 
 import npa_envs
 from npa_envs.world import replayed_launches
+from npa_envs.world.particles import Particles
+from npa_envs.world.rollout import rollout_particles
 
 BOX = (1.4, 1.4)
 
@@ -49,8 +51,10 @@ def steps_ready():
         {"update_prob": 0.001, "keep_every": 2, "steps": 4},
         {"by_world": True, "dt": 0.5, "steps": 1},
         {"equivariant": True},
+        {"position_noise": 0.01},
+        {"position_noise": 0.01, "by_world": True, "keep_every": 1, "steps": 19},
     ],
-    ids=["open", "box", "few", "by world", "equivariant"],
+    ids=["open", "box", "few", "by world", "equivariant", "noise", "noise by world"],
 )
 def test_replayed_rollouts_are_the_launched_ones(options, dtype):
     options = dict(options)
@@ -100,7 +104,7 @@ def test_worlds_of_inference_mode_are_stepped_too():
     assert_same((ready, run(rule, x, s)), (launched, launched))
 
 
-def test_what_needs_gradients_noise_or_a_rule_of_its_own_is_launched():
+def test_what_needs_gradients_or_a_rule_of_its_own_is_launched():
     class Own(npa_envs.NPARule):
         def forward(self, perception):
             return super().forward(perception)
@@ -109,11 +113,30 @@ def test_what_needs_gradients_noise_or_a_rule_of_its_own_is_launched():
     rule = make_rule()
     own = Own(2, 5, 12, eps0=0.3)
     for _ in range(4):
-        run(rule, x, s, position_noise=0.01)
         run(own, x, s)
         _, after = npa_envs.rollout(rule, x, s, 2)
         assert after.requires_grad
     assert not steps_ready()
+
+
+@pytest.mark.parametrize("particle_count", [5, 9])
+def test_a_world_is_the_same_in_every_batch_where_the_network_runs_world_by_world(particle_count):
+    # Torch's products of few rows depend on how many there are.
+    rule, count = npa_envs.load_rule("heart-first"), 30
+    x, s = random_world(count, particle_count, 2, 16, dtype=torch.float32, device="cpu", seed=0)
+
+    def after(chosen):
+        random = npa_envs.WorldRandom(range(count)).take(chosen)
+        options = {"generator": random, "position_noise": 0.01, "world_by_world": True}
+        return rollout_particles(rule, Particles(x[chosen], s[chosen]), 3, **options)
+
+    with torch.no_grad():
+        alone = [after(slice(k, k + 1)) for k in range(count)]
+        # Launched, then replayed.
+        together = [after(slice(count)) for _ in range(3)]
+    for number in range(2):
+        for worlds in together:
+            assert_same(worlds[number], torch.cat([world[number] for world in alone]))
 
 
 def test_threads_step_worlds_of_their_own():

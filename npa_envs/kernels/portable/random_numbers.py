@@ -22,7 +22,30 @@ ULP_24 = wp.constant(wp.float32(2.0**-24))
 ULP_32 = wp.constant(wp.float64(2.0**-32))
 ULP_53 = wp.constant(wp.float64(2.0**-53))
 
+GOLDEN = 0x9E3779B97F4A7C15
+"""Difference of successive states of SplitMix64."""
+MIXER_0 = wp.constant(wp.uint64(0xBF58476D1CE4E5B9))
+MIXER_1 = wp.constant(wp.uint64(0x94D049BB133111EB))
+
 words = wp.types.vector(4, wp.uint32)
+
+
+@wp.kernel(enable_backward=False, module=wp.get_module("npa_envs.kernels.mixed_keys"))
+def mix_keys(
+    advance: wp.int64,
+    keys: wp.array[wp.int64],
+    # outputs
+    mixed: wp.array[wp.int64],
+):
+    """Write the output of SplitMix64 for each key's state, advanced by `advance`.
+
+    Source: Steele, Lea and Flood, "Fast splittable pseudorandom number generators" (OOPSLA 2014).
+    """
+    world = wp.tid()
+    bits = wp.uint64(keys[world]) + wp.uint64(advance)
+    bits = (bits ^ (bits >> wp.uint64(30))) * MIXER_0
+    bits = (bits ^ (bits >> wp.uint64(27))) * MIXER_1
+    mixed[world] = wp.int64(bits ^ (bits >> wp.uint64(31)))
 
 
 @wp.func
