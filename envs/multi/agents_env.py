@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from operator import itemgetter
 from typing import Any
 
 import numpy as np
@@ -123,6 +124,27 @@ def joined_actions(
             "such numbers): check the policy; the world is not changed"
         )
     return joined
+
+
+def rows_at_once(
+    actions: Any, agents: Sequence[str], width: int, device: torch.device
+) -> Tensor | None:
+    """Return what `joined_actions` does for arrays of `width` numbers, [N, A], checked together.
+
+    None: that function has to look at each, as some are no such arrays or not finite.
+    """
+    if type(actions) is not dict or len(actions) != len(agents) or len(agents) < 2:
+        return None
+    try:
+        rows = itemgetter(*agents)(actions)
+    except KeyError:
+        return None
+    if {type(row) for row in rows} != {np.ndarray} or {row.shape for row in rows} != {(width,)}:
+        return None
+    if any(dtype.kind not in "biuf" for dtype in {row.dtype for row in rows}):
+        return None
+    joined = np.concatenate(rows, dtype=np.float32, casting="unsafe").reshape(-1, width)
+    return torch.from_numpy(joined).to(device) if np.isfinite(joined).all() else None
 
 
 def _names(agents: Sequence[str]) -> str:

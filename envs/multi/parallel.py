@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from itertools import repeat
 from typing import Any, ParamSpec
 
 import numpy as np
@@ -10,7 +11,7 @@ import torch
 from gymnasium.spaces import Box
 from torch import Tensor
 
-from npa_envs.envs.multi.agents_env import AgentsEnv, joined_actions
+from npa_envs.envs.multi.agents_env import AgentsEnv, joined_actions, rows_at_once
 from npa_envs.errors import MissingDependencyError, NPAError, shown, suggest
 
 try:
@@ -82,21 +83,26 @@ class CrowdEnv(AgentsEnv, KnownAgents):
             if not actions:
                 return {}, {}, {}, {}, {}
             raise NPAError("step needs a live agent, and there is none: call reset first")
-        worlds, acted, live = self.worlds, self.agents, self._live
-        shapes = [self.action_spaces[agent].shape for agent in acted]
-        action = joined_actions(actions, acted, shapes, worlds.device)
+        worlds, acted, of_live = self.worlds, self.agents, self._of_live
+        action = None
+        if worlds.by_particle:
+            action = rows_at_once(actions, acted, worlds.physics.action_dim, worlds.device)
+        if action is None:
+            shapes = [self.action_spaces[agent].shape for agent in acted]
+            action = joined_actions(actions, acted, shapes, worlds.device)
         with worlds.device_context():
             outcome = worlds.step(self._with_zeros(action))
-        infos, reasons = self._infos(outcome.numbers), outcome.reasons[0]
+        infos = self._infos(outcome.numbers)
         observations = self._by_agent(outcome.observation)
-        all_rewards, endings = outcome.rewards[0].tolist(), outcome.endings[0].tolist()
-        rewards, terminations = {}, {}
-        for k, agent in zip(live, acted, strict=True):
-            rewards[agent], terminations[agent] = all_rewards[k], endings[k] > 0
-            if reasons[k] is not None:
-                infos[agent]["reason"] = reasons[k]
-        truncations = dict.fromkeys(acted, bool(outcome.truncated[0]))
-        self._update_agents()
+        rewards = dict(zip(acted, of_live(outcome.rewards[0].tolist()), strict=True))
+        ended, truncated = outcome.endings[0] > 0, bool(outcome.truncated[0])
+        terminations = dict(zip(acted, of_live(ended.tolist()), strict=True))
+        truncations = dict.fromkeys(acted, truncated)
+        if truncated or ended.any():
+            for agent, reason in zip(acted, of_live(outcome.reasons[0]), strict=True):
+                if reason is not None:
+                    infos[agent]["reason"] = reason
+            self._update_agents()
         self._show()
         return observations, rewards, terminations, truncations, infos
 
@@ -121,6 +127,7 @@ class CrowdEnv(AgentsEnv, KnownAgents):
     def _update_agents(self) -> None:
         self._live = np.flatnonzero(self.worlds.live[0, : len(self.possible_agents)]).tolist()
         self.agents = [self.possible_agents[k] for k in self._live]
+        self._live_species = self._of_live(self.worlds.agent_species.tolist())
 
     def _with_zeros(self, action: Tensor) -> Tensor:
         """Return all particles' actions, [1, N, A], from the live agents', [N', A], and zeros."""
@@ -134,21 +141,22 @@ class CrowdEnv(AgentsEnv, KnownAgents):
 
     def _infos(self, numbers: dict[str, Tensor]) -> Infos:
         """Return infos of live agents: their species, and theirs of `numbers`, [1, M] each."""
-        rows = torch.stack(list(numbers.values()))[:, 0].tolist()
-        columns = dict(zip(numbers, rows, strict=True))
-        species = self.worlds.agent_species
-        return {
-            agent: {"species": int(species[k])} | {name: row[k] for name, row in columns.items()}
-            for k, agent in zip(self._live, self.agents, strict=True)
-        }
+        columns = map(self._of_live, torch.stack(list(numbers.values()))[:, 0].tolist())
+        names, rows = ("species", *numbers), zip(self._live_species, *columns, strict=True)
+        # Iterators make a dict in half the time of a comprehension.
+        return dict(zip(self.agents, map(dict, map(zip, repeat(names), rows)), strict=True))
 
     def _by_agent(self, observation: Tensor) -> dict[str, Any]:
         """Return each live agent's observation from all particles' perception, [1, N, P]."""
-        rows, spans = self._out(observation[0]), self.worlds.spans
-        return {
-            agent: rows[spans[k].start] if self.worlds.by_particle else rows[spans[k]]
-            for k, agent in zip(self._live, self.agents, strict=True)
-        }
+        rows, worlds = self._out(observation[0]), self.worlds
+        parts = rows if worlds.by_particle else [rows[span] for span in worlds.spans]
+        return dict(zip(self.agents, self._of_live(parts), strict=True))
+
+    def _of_live(self, values: Any) -> Any:
+        """Return the entries of live agents, of all agents' and perhaps an opponent's `values`."""
+        if len(self._live) == len(values):
+            return values
+        return [values[k] for k in self._live]
 
 
 def in_turns(
