@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from itertools import repeat
+from operator import attrgetter
 from typing import Any, ParamSpec
 
 import numpy as np
@@ -16,7 +17,7 @@ from npa_envs.errors import MissingDependencyError, NPAError, shown, suggest
 
 try:
     import pettingzoo
-    from pettingzoo.utils import parallel_to_aec
+    from pettingzoo.utils.conversions import parallel_to_aec_wrapper
     from pettingzoo.utils.wrappers import ClipOutOfBoundsWrapper, OrderEnforcingWrapper
 except ImportError as error:
     raise MissingDependencyError(
@@ -159,6 +160,50 @@ class CrowdEnv(AgentsEnv, KnownAgents):
         return [values[k] for k in self._live]
 
 
+class TurnsEnv(OrderEnforcingWrapper):  # type: ignore[misc]
+    """A parallel environment whose agents act in turn, with PettingZoo's checks of the order.
+
+    The world is stepped after the last agent. `clipped`: actions are clipped to their box. Without
+    errors to report, it passes by PettingZoo's chain of wrappers, which is slow for many agents.
+    """
+
+    def __init__(self, parallel_env: KnownAgents, *, clipped: bool) -> None:
+        self._turns = turns = parallel_to_aec_wrapper(parallel_env)
+        self._unit_shapes: dict[str, tuple[int, ...]] | None = None
+        """Shapes of actions that are only checked to lie in [-1, 1]; None: none is checked."""
+        spaces = {agent: turns.action_space(agent) for agent in turns.possible_agents}
+        if clipped and all(isinstance(space, Box) for space in spaces.values()):
+            self._unit_shapes = {
+                agent: space.shape
+                for agent, space in spaces.items()
+                if (space.low == -1.0).all() and (space.high == 1.0).all()
+            }
+        super().__init__(turns if self._unit_shapes is None else ClipOutOfBoundsWrapper(turns))
+
+    agents = property(attrgetter("_turns.agents"))
+    agent_selection = property(attrgetter("_turns.agent_selection"))
+
+    def last(self, observe: bool = True) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        """Return the next agent's observation, reward since it acted, flags and info."""
+        return self._turns.last(observe) if self._has_reset else super().last(observe)
+
+    def step(self, action: Any) -> None:
+        """Take the action of the agent whose turn it is."""
+        turns, shapes = self._turns, self._unit_shapes
+        if not self._has_reset or not turns.agents:
+            return super().step(action)
+        if shapes is not None and action is not None:
+            is_array = type(action) is np.ndarray and action.dtype == np.float32
+            if not is_array or action.shape != shapes.get(turns.agent_selection):
+                return super().step(action)
+            # Not a number is not inside either.
+            if not np.maximum.reduce(np.abs(action), axis=None) <= 1.0:
+                return super().step(action)
+        self._has_updated = True
+        turns.step(action)
+        return None
+
+
 def in_turns(
     parallel_env: Callable[Arguments, KnownAgents],
 ) -> tuple[Callable[Arguments, Any], Callable[Arguments, Any]]:
@@ -166,13 +211,11 @@ def in_turns(
 
     def raw_env(*args: Arguments.args, **config: Arguments.kwargs) -> Any:
         """Return `parallel_env` with agents that act in turn; the world steps after the last."""
-        return parallel_to_aec(parallel_env(*args, **config))
+        return TurnsEnv(parallel_env(*args, **config), clipped=False)
 
     def env(*args: Arguments.args, **config: Arguments.kwargs) -> Any:
-        """Return `raw_env` with a check of the order, and actions clipped to their box."""
-        turns = raw_env(*args, **config)
-        is_box = isinstance(turns.action_space(turns.possible_agents[0]), Box)
-        return OrderEnforcingWrapper(ClipOutOfBoundsWrapper(turns)) if is_box else turns
+        """Return `raw_env` with actions clipped to their box."""
+        return TurnsEnv(parallel_env(*args, **config), clipped=True)
 
     return raw_env, env
 
