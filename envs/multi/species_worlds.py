@@ -448,7 +448,7 @@ class WorldGroup:
 
     def perception(self, population: Population | None = None, *, stepped: bool = False) -> Tensor:
         """Return what particles perceive, [B', N', P]; `stepped`: with neighbours of the step."""
-        x, s, counts, _ = population or self.population
+        x, s, counts, *_ = population or self.population
         neighbours = self._neighbours if stepped else None
         rows = (neighbours or NeighbourState(x, s, self._physics)).perceive()
         if self._task.config.perception == "per_species":
@@ -464,8 +464,12 @@ class WorldGroup:
         # Sums of ones are exact in any order.
         count = torch.zeros(len(inside), self._agent_count, device=inside.device)
         self.diverged = count.index_add_(1, self._owners, inside.float()) == 0.0
-        self.terms = self.loss_terms()
-        self._neighbours = NeighbourState(x, s, physics)
+        if self._neighbours is None or not self._neighbours.update():
+            self._neighbours = NeighbourState(x, s, physics, replayed=True)
+        population = self.population
+        if not x.is_cuda:
+            population = population._replace(neighbours=self._neighbours)
+        self.terms = self.loss_terms(population)
 
 
 def population_of(

@@ -6,6 +6,7 @@ only tensors that the adjoint of the case reads.
 
 from __future__ import annotations
 
+import contextlib
 import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple, get_args
@@ -23,7 +24,7 @@ from npa_envs.checks import (
     checked_flag,
 )
 from npa_envs.ops.custom_op import check_derivatives, custom_op, once_differentiable
-from npa_envs.ops.launch import RecordedLaunches, is_aligned, launch
+from npa_envs.ops.launch import RecordedLaunches, channel_width, is_aligned, launch
 from npa_envs.ops.perception_passes import (
     SavedPerception,
     compute_densities,
@@ -360,6 +361,8 @@ def updates_in_parts(
     return updates, Rows(ordered.row_of, ordered.row_particle, ordered.starts, plan.row_base)
 
 
+SMOOTHED_ONLY = Terms(state_gradient=False, moment_inverse=None, density_gradient=False)
+
 # For environments: every particle, in the caller's order, clipped, without gradients.
 
 
@@ -367,24 +370,35 @@ class NeighbourState:
     """Worlds x and s, unchecked, sorted into cells with densities; they must not change.
 
     `world_indices`, int64, shape [B], are the worlds' indices in a larger batch, into which
-    perception is written; None: the worlds are the whole batch.
+    perception is written; None: the worlds are the whole batch. With `replayed` contiguous worlds
+    may change before an `update`.
     """
 
     def __init__(
-        self, x: Tensor, s: Tensor, physics: Physics, world_indices: Tensor | None = None
+        self,
+        x: Tensor,
+        s: Tensor,
+        physics: Physics,
+        world_indices: Tensor | None = None,
+        *,
+        replayed: bool = False,
     ) -> None:
         x, s = x.contiguous(), s.contiguous()
         total = x.shape[0] * x.shape[1]
         plan = plan_kernels(x, x.shape, s.shape[2], total, False, physics, for_environments=True)
         with_lists = plan.lists_neighbours
         in_place = with_lists and plan.state_dim % plan.width == 0 and is_aligned(s)
-        ordered = sort_worlds(plan, x, None if in_place else s, None, with_rows=not with_lists)
-        densities = compute_densities(
-            plan,
-            ordered,
-            state_index=ordered.original_index if in_place else None,
-            with_particles=False,
-        )
+        self._sorting = RecordedLaunches() if replayed and plan.runs("sort") == "world" else None
+        with contextlib.nullcontext() if self._sorting is None else self._sorting.recording():
+            ordered = sort_worlds(plan, x, None if in_place else s, None, with_rows=not with_lists)
+            densities = compute_densities(
+                plan,
+                ordered,
+                state_index=ordered.original_index if in_place else None,
+                with_particles=False,
+            )
+        self._sorted = plan, ordered, densities
+        self._smoothing: tuple[Tensor, Tensor, Tensor, Tensor, RecordedLaunches] | None = None
         destination = ordered.original_index
         if world_indices is not None:
             moved = world_indices - torch.arange(len(world_indices), device=x.device)
@@ -427,3 +441,34 @@ class NeighbourState:
         self._recorded.move(self._slots, rows)
         self._recorded.replay()
         return out
+
+    def update(self) -> bool:
+        """Sort the worlds again, as they are now; return False, and do nothing, on CUDA."""
+        if self._sorting is None:
+            return False
+        self._sorting.replay()
+        return True
+
+    def smoothed(self, values: Tensor) -> Tensor:
+        """Return values, [N, F], smoothed in each world, [B, N, F], as `perceive` does; on a CPU.
+
+        Later calls with the same tensor overwrite the result, and take less CPU time.
+        """
+        plan, ordered, densities = self._sorted
+        if self._smoothing is None or self._smoothing[0] is not values:
+            assert plan.on_cpu, "CUDA's lists of neighbours are of other states"
+            physics, width = plan.physics._replace(terms=SMOOTHED_ONLY), values.shape[1]
+            plan = plan._replace(state_dim=width, width=channel_width(width), physics=physics)
+            padding = plan.group_count * plan.width - width
+            padded = torch.nn.functional.pad(values, (0, padding)).repeat(plan.world_count, 1)
+            states = torch.empty_like(padded)
+            out = states.new_empty(plan.total, 2 * width)
+            recorded = RecordedLaunches()
+            ordered = ordered._replace(states=states.view(-1, plan.width))
+            destination = ordered.original_index
+            recorded.add(*perception_launch(plan, ordered, densities, out, destination=destination))
+            self._smoothing = values, padded, states, out, recorded
+        _, padded, states, out, recorded = self._smoothing
+        torch.index_select(padded, 0, ordered.original_index, out=states)
+        recorded.replay()
+        return out.view(plan.world_count, *values.shape[:1], -1)[..., values.shape[1] :]
