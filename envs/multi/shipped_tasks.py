@@ -22,9 +22,6 @@ from npa_envs.world.randomness import StreamId, WorldRandom
 class MixingTask(SpeciesTask):
     """Mix the species; a particle's loss is 1 minus the entropy of species around it."""
 
-    _tagged: Tensor | None = None
-    """Species of the particles that `_tags` are of."""
-
     def losses(self, population: Population) -> Mapping[str, Tensor]:
         """Return the mean loss of each species' particles, by name, shape [B, S]."""
         spans = [population.spans[k] for k in _present(population)]
@@ -45,24 +42,23 @@ class MixingTask(SpeciesTask):
         one species in the neighbourhood, 1 with equal parts of all S.
         """
         species_count = len(population.counts)
-        if self._tagged is not population.species:
-            indices = torch.arange(species_count, device=population.x.device)
-            self._tags = (population.species[:, None] == indices).to(population.x)
-            self._tagged = population.species
         if population.neighbours is not None:
-            smoothed = population.neighbours.smoothed(self._tags)
-        else:
-            perceived = perceive(
-                population.x,
-                self._tags.expand(len(population.x), -1, -1).contiguous(),
-                self.config.eps,
-                box=self.config.periodic_box,
-                detach_positions=False,
-                state_gradient=False,
-                moment_correction=False,
-                density_gradient=False,
-            )
-            smoothed = perceived[..., species_count:]
+            smoothed = population.neighbours.smoothed_species(population.species, species_count)
+            fractions = smoothed / smoothed.sum(dim=2, keepdim=True)
+            return torch.special.entr(fractions).sum(dim=2) / math.log(species_count)
+        indices = torch.arange(species_count, device=population.x.device)
+        tags = (population.species[:, None] == indices).to(population.x)
+        perceived = perceive(
+            population.x,
+            tags.expand(len(population.x), -1, -1).contiguous(),
+            self.config.eps,
+            box=self.config.periodic_box,
+            detach_positions=False,
+            state_gradient=False,
+            moment_correction=False,
+            density_gradient=False,
+        )
+        smoothed = perceived[..., species_count:]
         fractions = smoothed / smoothed.sum(dim=2, keepdim=True)
         # At 0 the entropy has no finite derivative, which would give NaN gradients.
         present = fractions > 0.0

@@ -449,26 +449,26 @@ class NeighbourState:
         self._sorting.replay()
         return True
 
-    def smoothed(self, values: Tensor) -> Tensor:
-        """Return values, [N, F], smoothed in each world, [B, N, F], as `perceive` does; on a CPU.
+    def smoothed_species(self, species: Tensor, species_count: int) -> Tensor:
+        """Return tags of each species, smoothed as `perceive` smooths states, [B, N, S].
 
-        Later calls with the same tensor overwrite the result, and take less CPU time.
+        A tag is 1 for particles of its species, int64 [N], and 0 for others; only on a CPU. Later
+        calls for the same tensor `species` overwrite the result and take less CPU time.
         """
         plan, ordered, densities = self._sorted
-        if self._smoothing is None or self._smoothing[0] is not values:
-            assert plan.on_cpu, "CUDA's lists of neighbours are of other states"
-            physics, width = plan.physics._replace(terms=SMOOTHED_ONLY), values.shape[1]
-            plan = plan._replace(state_dim=width, width=channel_width(width), physics=physics)
-            padding = plan.group_count * plan.width - width
-            padded = torch.nn.functional.pad(values, (0, padding)).repeat(plan.world_count, 1)
-            states = torch.empty_like(padded)
-            out = states.new_empty(plan.total, 2 * width)
+        if self._smoothing is None or self._smoothing[0] is not species:
+            assert plan.on_cpu, "lists of neighbours on CUDA have the states of the worlds"
+            physics, width = plan.physics._replace(terms=SMOOTHED_ONLY), channel_width(species_count)
+            plan = plan._replace(state_dim=species_count, width=width, physics=physics)
+            tags = species[:, None] == torch.arange(plan.group_count * width)
+            tags = tags.to(self._like.dtype).repeat(plan.world_count, 1)
+            states = torch.empty_like(tags)
+            out = states.new_empty(plan.total, 2 * species_count)
+            ordered, destination = ordered._replace(states=states), ordered.original_index
             recorded = RecordedLaunches()
-            ordered = ordered._replace(states=states.view(-1, plan.width))
-            destination = ordered.original_index
             recorded.add(*perception_launch(plan, ordered, densities, out, destination=destination))
-            self._smoothing = values, padded, states, out, recorded
-        _, padded, states, out, recorded = self._smoothing
-        torch.index_select(padded, 0, ordered.original_index, out=states)
+            self._smoothing = species, tags, states, out, recorded
+        _, tags, states, out, recorded = self._smoothing
+        torch.index_select(tags, 0, ordered.original_index, out=states)
         recorded.replay()
-        return out.view(plan.world_count, *values.shape[:1], -1)[..., values.shape[1] :]
+        return out.view(*self._shape[:2], -1)[..., species_count:]
