@@ -163,45 +163,34 @@ class CrowdEnv(AgentsEnv, KnownAgents):
 class TurnsEnv(OrderEnforcingWrapper):  # type: ignore[misc]
     """A parallel environment whose agents act in turn, with PettingZoo's checks of the order.
 
-    The world is stepped after the last agent. `clipped`: actions are clipped to their box. Without
-    errors to report, it passes by PettingZoo's chain of wrappers, which is slow for many agents.
+    The world is stepped after the last agent. `clips`: actions are clipped to their box. Calls are
+    passed to PettingZoo's wrappers only if they have something to say: these are slow.
     """
-
-    def __init__(self, parallel_env: KnownAgents, *, clipped: bool) -> None:
-        self._turns = turns = parallel_to_aec_wrapper(parallel_env)
-        self._unit_shapes: dict[str, tuple[int, ...]] | None = None
-        """Shapes of actions that are only checked to lie in [-1, 1]; None: none is checked."""
-        spaces = {agent: turns.action_space(agent) for agent in turns.possible_agents}
-        if clipped and all(isinstance(space, Box) for space in spaces.values()):
-            self._unit_shapes = {
-                agent: space.shape
-                for agent, space in spaces.items()
-                if (space.low == -1.0).all() and (space.high == 1.0).all()
-            }
-        super().__init__(turns if self._unit_shapes is None else ClipOutOfBoundsWrapper(turns))
 
     agents = property(attrgetter("_turns.agents"))
     agent_selection = property(attrgetter("_turns.agent_selection"))
 
+    def __init__(self, parallel_env: KnownAgents, *, clips: bool) -> None:
+        self._turns = turns = parallel_to_aec_wrapper(parallel_env)
+        boxes = [isinstance(turns.action_space(a), Box) for a in turns.possible_agents]
+        self._clips = clips and all(boxes)
+        super().__init__(ClipOutOfBoundsWrapper(turns) if self._clips else turns)
+
     def last(self, observe: bool = True) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Return the next agent's observation, reward since it acted, flags and info."""
-        return self._turns.last(observe) if self._has_reset else super().last(observe)
+        return (self._turns if self._has_reset else super()).last(observe)
 
     def step(self, action: Any) -> None:
         """Take the action of the agent whose turn it is."""
-        turns, shapes = self._turns, self._unit_shapes
-        if not self._has_reset or not turns.agents:
-            return super().step(action)
-        if shapes is not None and action is not None:
-            is_array = type(action) is np.ndarray and action.dtype == np.float32
-            if not is_array or action.shape != shapes.get(turns.agent_selection):
-                return super().step(action)
-            # Not a number is not inside either.
-            if not np.maximum.reduce(np.abs(action), axis=None) <= 1.0:
-                return super().step(action)
-        self._has_updated = True
-        turns.step(action)
-        return None
+        turns = self._turns
+        fits = self._has_reset and bool(turns.agents)
+        if fits and self._clips and action is not None:
+            fits = type(action) is np.ndarray and action.dtype == np.float32
+            fits = fits and action.shape == turns.action_space(turns.agent_selection).shape
+            # The box of all actions; not a number is outside of it.
+            fits = fits and bool(np.abs(action).max() <= 1.0)
+        self._has_updated |= fits
+        (turns if fits else super()).step(action)
 
 
 def in_turns(
@@ -211,11 +200,11 @@ def in_turns(
 
     def raw_env(*args: Arguments.args, **config: Arguments.kwargs) -> Any:
         """Return `parallel_env` with agents that act in turn; the world steps after the last."""
-        return TurnsEnv(parallel_env(*args, **config), clipped=False)
+        return TurnsEnv(parallel_env(*args, **config), clips=False)
 
     def env(*args: Arguments.args, **config: Arguments.kwargs) -> Any:
         """Return `raw_env` with actions clipped to their box."""
-        return TurnsEnv(parallel_env(*args, **config), clipped=True)
+        return TurnsEnv(parallel_env(*args, **config), clips=True)
 
     return raw_env, env
 
