@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from operator import itemgetter
 from typing import Any
 
 import numpy as np
@@ -89,6 +88,9 @@ def joined_actions(
 
     Actions must be finite, and given for exactly these agents.
     """
+    at_once = _joined_at_once(actions, agents, shapes, device)
+    if at_once is not None:
+        return at_once
     if not isinstance(actions, Mapping):
         raise NPAError(
             f"actions must be a dict with an action for each live agent, got "
@@ -126,25 +128,26 @@ def joined_actions(
     return joined
 
 
-def rows_at_once(
-    actions: Any, agents: Sequence[str], width: int, device: torch.device
+def _joined_at_once(
+    actions: Any, agents: Sequence[str], shapes: Sequence[tuple[int, ...]], device: torch.device
 ) -> Tensor | None:
-    """Return what `joined_actions` does for arrays of `width` numbers, [N, A], checked together.
+    """Return the result of `joined_actions` for NumPy arrays, whose checks are of all together.
 
-    None: that function has to look at each, as some are no such arrays or not finite.
+    None: actions have to be looked at one by one, to be converted or to find which one is wrong.
     """
-    if type(actions) is not dict or len(actions) != len(agents) or len(agents) < 2:
+    if type(actions) is not dict or actions.keys() != set(agents):
         return None
-    try:
-        rows = itemgetter(*agents)(actions)
-    except KeyError:
+    rows = [actions[agent] for agent in agents]
+    if {type(row) for row in rows} != {np.ndarray} or [row.shape for row in rows] != shapes:
         return None
-    if {type(row) for row in rows} != {np.ndarray} or {row.shape for row in rows} != {(width,)}:
+    if not {row.dtype for row in rows} <= {np.dtype(np.float32), np.dtype(np.float64)}:
         return None
-    if any(dtype.kind not in "biuf" for dtype in {row.dtype for row in rows}):
+    joined = np.concatenate(rows, -min(rows[0].ndim, 2), dtype=np.float32)
+    if not np.isfinite(joined).all():
         return None
-    joined = np.concatenate(rows, dtype=np.float32, casting="unsafe").reshape(-1, width)
-    return torch.from_numpy(joined).to(device) if np.isfinite(joined).all() else None
+    # The action of a single particle has no dimension of rows.
+    joined = joined if joined.ndim > 1 else joined.reshape(len(rows), -1)
+    return torch.from_numpy(joined).to(device)
 
 
 def _names(agents: Sequence[str]) -> str:

@@ -473,14 +473,13 @@ class WorldGroup:
             # Sums of ones are exact in any order.
             count = torch.zeros(len(inside), self._agent_count, device=inside.device)
             self.diverged = count.index_add_(1, self._owners, inside.float()) == 0.0
-        population = self.population
-        if not x.is_cuda:
-            if self._neighbours is None or not self._neighbours.update():
-                self._neighbours = NeighbourState(x, s, physics, replayed=True)
-            population = population._replace(neighbours=self._neighbours)
-        self.terms = self.loss_terms(population)
-        if x.is_cuda:
+        if x.is_cuda or self._neighbours is None:
+            self.terms = self.loss_terms()
             self._neighbours = NeighbourState(x, s, physics)
+        else:
+            self._neighbours.update()
+            sorted_population = self.population._replace(neighbours=self._neighbours)
+            self.terms = self.loss_terms(sorted_population)
 
 
 def population_of(

@@ -6,7 +6,6 @@ only tensors that the adjoint of the case reads.
 
 from __future__ import annotations
 
-import contextlib
 import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple, get_args
@@ -361,44 +360,41 @@ def updates_in_parts(
     return updates, Rows(ordered.row_of, ordered.row_particle, ordered.starts, plan.row_base)
 
 
-SMOOTHED_ONLY = Terms(state_gradient=False, moment_inverse=None, density_gradient=False)
-
 # For environments: every particle, in the caller's order, clipped, without gradients.
 
 
 class NeighbourState:
-    """Worlds x and s, unchecked, sorted into cells with densities; they must not change.
+    """Worlds x and s, unchecked, sorted into cells with densities; changes need an `update`.
 
     `world_indices`, int64, shape [B], are the worlds' indices in a larger batch, into which
-    perception is written; None: the worlds are the whole batch. With `replayed` contiguous worlds
-    may change before an `update`.
+    perception is written; None: the worlds are the whole batch.
     """
 
     def __init__(
-        self,
-        x: Tensor,
-        s: Tensor,
-        physics: Physics,
-        world_indices: Tensor | None = None,
-        *,
-        replayed: bool = False,
+        self, x: Tensor, s: Tensor, physics: Physics, world_indices: Tensor | None = None
     ) -> None:
-        x, s = x.contiguous(), s.contiguous()
+        self._worlds = x, s, world_indices
         total = x.shape[0] * x.shape[1]
-        plan = plan_kernels(x, x.shape, s.shape[2], total, False, physics, for_environments=True)
+        self._plan = plan_kernels(
+            x, x.shape, s.shape[2], total, False, physics, for_environments=True
+        )
+        self._sorting: RecordedLaunches | None = None
+        self._shape = *x.shape[:2], physics.perception_dim
+        self._like = x
+        self._sort()
+
+    def _sort(self) -> None:
+        plan, (x, s, world_indices) = self._plan, self._worlds
+        x, s = x.contiguous(), s.contiguous()
         with_lists = plan.lists_neighbours
         in_place = with_lists and plan.state_dim % plan.width == 0 and is_aligned(s)
-        self._sorting = RecordedLaunches() if replayed and plan.runs("sort") == "world" else None
-        with contextlib.nullcontext() if self._sorting is None else self._sorting.recording():
-            ordered = sort_worlds(plan, x, None if in_place else s, None, with_rows=not with_lists)
-            densities = compute_densities(
-                plan,
-                ordered,
-                state_index=ordered.original_index if in_place else None,
-                with_particles=False,
-            )
-        self._sorted = plan, ordered, densities
-        self._smoothing: tuple[Tensor, Tensor, Tensor, Tensor, RecordedLaunches] | None = None
+        ordered = sort_worlds(plan, x, None if in_place else s, None, with_rows=not with_lists)
+        densities = compute_densities(
+            plan,
+            ordered,
+            state_index=ordered.original_index if in_place else None,
+            with_particles=False,
+        )
         destination = ordered.original_index
         if world_indices is not None:
             moved = world_indices - torch.arange(len(world_indices), device=x.device)
@@ -411,12 +407,26 @@ class NeighbourState:
             densities,
             states=s if in_place else None,
             destination=destination,
-            limit=physics.limits.perception,
+            limit=plan.physics.limits.perception,
         )
-        self._shape = *x.shape[:2], physics.perception_dim
-        self._like = x
+        self._sorted = ordered, densities
+        self._smoothing: tuple[Tensor, Tensor, Tensor, Tensor, RecordedLaunches] | None = None
         self._perceived = False
         self._recorded: RecordedLaunches | None = None
+
+    def update(self) -> None:
+        """Sort contiguous worlds, the whole batch, again after they changed in place.
+
+        Later calls for small worlds on a CPU take less time.
+        """
+        if self._sorting is not None:
+            self._sorting.replay()
+        elif self._plan.runs("sort") == "world":
+            self._sorting = RecordedLaunches()
+            with self._sorting.recording():
+                self._sort()
+        else:
+            self._sort()
 
     def perceive(self, out: Tensor | None = None) -> Tensor:
         """Return every particle's perception, clipped to `Limits.perception`, shape [B, N, P].
@@ -442,24 +452,18 @@ class NeighbourState:
         self._recorded.replay()
         return out
 
-    def update(self) -> bool:
-        """Sort the worlds again, as they are now; return False, and do nothing, on CUDA."""
-        if self._sorting is None:
-            return False
-        self._sorting.replay()
-        return True
-
     def smoothed_species(self, species: Tensor, species_count: int) -> Tensor:
         """Return tags of each species, smoothed as `perceive` smooths states, [B, N, S].
 
         A tag is 1 for particles of its species, int64 [N], and 0 for others; only on a CPU. Later
         calls for the same tensor `species` overwrite the result and take less CPU time.
         """
-        plan, ordered, densities = self._sorted
+        ordered, densities = self._sorted
         if self._smoothing is None or self._smoothing[0] is not species:
-            assert plan.on_cpu, "lists of neighbours on CUDA have the states of the worlds"
-            physics, width = plan.physics._replace(terms=SMOOTHED_ONLY), channel_width(species_count)
-            plan = plan._replace(state_dim=species_count, width=width, physics=physics)
+            assert self._plan.on_cpu, "CUDA's lists of neighbours are of the worlds' states"
+            width = channel_width(species_count)
+            physics = self._plan.physics._replace(terms=Terms(False, None, False))
+            plan = self._plan._replace(state_dim=species_count, width=width, physics=physics)
             tags = species[:, None] == torch.arange(plan.group_count * width)
             tags = tags.to(self._like.dtype).repeat(plan.world_count, 1)
             states = torch.empty_like(tags)
