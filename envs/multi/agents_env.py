@@ -146,7 +146,7 @@ def _joined_at_once(
     if not np.isfinite(joined).all():
         return None
     # The action of a single particle has no dimension of rows.
-    joined = joined if joined.ndim > 1 else joined.reshape(len(rows), -1)
+    joined = joined.reshape(*joined.shape[:-2], -1, shapes[0][-1])
     return torch.from_numpy(joined).to(device)
 
 

@@ -169,9 +169,9 @@ class TurnsEnv(OrderEnforcingWrapper):  # type: ignore[misc]
     def __str__(self) -> str:
         return str(self.env)
 
-    def last(self, observe: bool = True) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+    def last(self, observe: bool = True) -> Any:
         """Return the next agent's observation, reward since it acted, flags and info."""
-        return (self._turns if self._has_reset else super()).last(observe)
+        return self._turns.last(observe) if self._has_reset else super().last(observe)
 
     def step(self, action: Any) -> None:
         """Take the action of the agent whose turn it is."""
@@ -183,7 +183,8 @@ class TurnsEnv(OrderEnforcingWrapper):  # type: ignore[misc]
             # The box of all actions; not a number is outside of it.
             fits = fits and bool(np.abs(action).max() <= 1.0)
         self._has_updated |= fits
-        (turns if fits else super()).step(action)
+        step = turns.step if fits else super().step
+        step(action)
 
 
 def in_turns(

@@ -45,7 +45,8 @@ class MixingTask(SpeciesTask):
         if population.neighbours is not None:
             smoothed = population.neighbours.smoothed_species(population.species, species_count)
             fractions = smoothed / smoothed.sum(dim=2, keepdim=True)
-            return torch.special.entr(fractions).sum(dim=2) / math.log(species_count)
+            summed: Tensor = torch.special.entr(fractions).sum(dim=2)
+            return summed / math.log(species_count)
         indices = torch.arange(species_count, device=population.x.device)
         tags = (population.species[:, None] == indices).to(population.x)
         perceived = perceive(

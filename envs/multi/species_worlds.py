@@ -478,8 +478,7 @@ class WorldGroup:
             self._neighbours = NeighbourState(x, s, physics)
         else:
             self._neighbours.update()
-            sorted_population = self.population._replace(neighbours=self._neighbours)
-            self.terms = self.loss_terms(sorted_population)
+            self.terms = self.loss_terms(self.population._replace(neighbours=self._neighbours))
 
 
 def population_of(

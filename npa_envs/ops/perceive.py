@@ -374,13 +374,10 @@ class NeighbourState:
         self, x: Tensor, s: Tensor, physics: Physics, world_indices: Tensor | None = None
     ) -> None:
         self._worlds = x, s, world_indices
-        total = x.shape[0] * x.shape[1]
-        self._plan = plan_kernels(
-            x, x.shape, s.shape[2], total, False, physics, for_environments=True
-        )
-        self._sorting: RecordedLaunches | None = None
         self._shape = *x.shape[:2], physics.perception_dim
-        self._like = x
+        sizes = x.shape, s.shape[2], x.shape[:2].numel()
+        self._plan = plan_kernels(x, *sizes, False, physics, for_environments=True)
+        self._sorting: RecordedLaunches | None = None
         self._sort()
 
     def _sort(self) -> None:
@@ -410,7 +407,7 @@ class NeighbourState:
             limit=plan.physics.limits.perception,
         )
         self._sorted = ordered, densities
-        self._smoothing: tuple[Tensor, Tensor, Tensor, Tensor, RecordedLaunches] | None = None
+        self._smoothing: tuple[Tensor, Tensor, Tensor, RecordedLaunches] | None = None
         self._perceived = False
         self._recorded: RecordedLaunches | None = None
 
@@ -435,7 +432,7 @@ class NeighbourState:
         tensor. Later calls take less CPU time.
         """
         if out is None:
-            out = self._like.new_empty(self._shape)
+            out = self._worlds[0].new_empty(self._shape)
         rows = out.view(-1, self._shape[-1])
         if not self._perceived:
             # Many worlds are perceived once: recorded launches would cost more than they save.
@@ -456,23 +453,23 @@ class NeighbourState:
         """Return tags of each species, smoothed as `perceive` smooths states, [B, N, S].
 
         A tag is 1 for particles of its species, int64 [N], and 0 for others; only on a CPU. Later
-        calls for the same tensor `species` overwrite the result and take less CPU time.
+        calls, for the same species, overwrite the result and take less CPU time.
         """
         ordered, densities = self._sorted
-        if self._smoothing is None or self._smoothing[0] is not species:
+        if self._smoothing is None:
             assert self._plan.on_cpu, "CUDA's lists of neighbours are of the worlds' states"
             width = channel_width(species_count)
             physics = self._plan.physics._replace(terms=Terms(False, None, False))
             plan = self._plan._replace(state_dim=species_count, width=width, physics=physics)
-            tags = species[:, None] == torch.arange(plan.group_count * width)
-            tags = tags.to(self._like.dtype).repeat(plan.world_count, 1)
-            states = torch.empty_like(tags)
-            out = states.new_empty(plan.total, 2 * species_count)
+            tags = (species[:, None] == torch.arange(plan.group_count * width)).to(densities[0])
+            tags = tags.repeat(plan.world_count, 1)
+            states, out = torch.empty_like(tags), tags.new_empty(plan.total, 2 * species_count)
             ordered, destination = ordered._replace(states=states), ordered.original_index
             recorded = RecordedLaunches()
             recorded.add(*perception_launch(plan, ordered, densities, out, destination=destination))
-            self._smoothing = species, tags, states, out, recorded
-        _, tags, states, out, recorded = self._smoothing
+            smoothed = out.view(*self._shape[:2], -1)[..., species_count:]
+            self._smoothing = tags, states, smoothed, recorded
+        tags, states, smoothed, recorded = self._smoothing
         torch.index_select(tags, 0, ordered.original_index, out=states)
         recorded.replay()
-        return out.view(*self._shape[:2], -1)[..., species_count:]
+        return smoothed
