@@ -138,16 +138,14 @@ def _joined_at_once(
     if type(actions) is not dict or actions.keys() != set(agents):
         return None
     rows = [actions[agent] for agent in agents]
-    if {type(row) for row in rows} != {np.ndarray} or [row.shape for row in rows] != shapes:
-        return None
-    if not {row.dtype for row in rows} <= {np.dtype(np.float32), np.dtype(np.float64)}:
+    alike = {type(row) for row in rows} == {np.ndarray} and [row.shape for row in rows] == shapes
+    if not alike or not {row.dtype for row in rows} <= {np.dtype("f4"), np.dtype("f8")}:
         return None
     joined = np.concatenate(rows, -min(rows[0].ndim, 2), dtype=np.float32)
     if not np.isfinite(joined).all():
         return None
     # The action of a single particle has no dimension of rows.
-    joined = joined.reshape(*joined.shape[:-2], -1, shapes[0][-1])
-    return torch.from_numpy(joined).to(device)
+    return torch.from_numpy(joined.reshape(*joined.shape[:-2], -1, shapes[0][-1])).to(device)
 
 
 def _names(agents: Sequence[str]) -> str:

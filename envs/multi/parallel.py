@@ -159,15 +159,13 @@ class TurnsEnv(OrderEnforcingWrapper):  # type: ignore[misc]
 
     agents = property(attrgetter("_turns.agents"))
     agent_selection = property(attrgetter("_turns.agent_selection"))
+    __str__ = ClipOutOfBoundsWrapper.__str__
 
     def __init__(self, parallel_env: KnownAgents, *, clips: bool) -> None:
         self._turns = turns = parallel_to_aec_wrapper(parallel_env)
         boxes = [isinstance(turns.action_space(a), Box) for a in turns.possible_agents]
         self._clips = clips and all(boxes)
         super().__init__(ClipOutOfBoundsWrapper(turns) if self._clips else turns)
-
-    def __str__(self) -> str:
-        return str(self.env)
 
     def last(self, observe: bool = True) -> Any:
         """Return the next agent's observation, reward since it acted, flags and info."""
@@ -183,8 +181,7 @@ class TurnsEnv(OrderEnforcingWrapper):  # type: ignore[misc]
             # The box of all actions; not a number is outside of it.
             fits = fits and bool(np.abs(action).max() <= 1.0)
         self._has_updated |= fits
-        step = turns.step if fits else super().step
-        step(action)
+        (turns.step if fits else super().step)(action)
 
 
 def in_turns(
