@@ -92,6 +92,9 @@ def joined_actions(
 
     Actions must be finite, and given for exactly these agents.
     """
+    at_once = _joined_at_once(actions, agents, shapes, device)
+    if at_once is not None:
+        return at_once
     if not isinstance(actions, Mapping):
         raise NPAError(
             f"actions must be a dict with an action for each live agent, got "
@@ -126,6 +129,26 @@ def joined_actions(
             "such numbers): check the policy; the world is not changed"
         )
     return joined
+
+
+def _joined_at_once(
+    actions: Any, agents: Sequence[str], shapes: Sequence[tuple[int, ...]], device: torch.device
+) -> Tensor | None:
+    """Return the result of `joined_actions` for NumPy arrays, whose checks are of all together.
+
+    None: actions have to be looked at one by one, to be converted or to find which one is wrong.
+    """
+    if type(actions) is not dict or actions.keys() != set(agents):
+        return None
+    rows = [actions[agent] for agent in agents]
+    alike = {type(row) for row in rows} == {np.ndarray} and [row.shape for row in rows] == shapes
+    if not alike or not {row.dtype for row in rows} <= {np.dtype("f4"), np.dtype("f8")}:
+        return None
+    joined = np.concatenate(rows, -min(rows[0].ndim, 2), dtype=np.float32)
+    if not np.isfinite(joined).all():
+        return None
+    # The action of a single particle has no dimension of rows.
+    return torch.from_numpy(joined.reshape(*joined.shape[:-2], -1, shapes[0][-1])).to(device)
 
 
 def _names(agents: Sequence[str]) -> str:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from itertools import compress, repeat
+from operator import attrgetter
 from typing import Any, ParamSpec
 
 import numpy as np
@@ -15,7 +17,7 @@ from npa_envs.errors import MissingDependencyError, NPAError, shown, suggest
 
 try:
     import pettingzoo
-    from pettingzoo.utils import parallel_to_aec
+    from pettingzoo.utils.conversions import parallel_to_aec_wrapper
     from pettingzoo.utils.wrappers import ClipOutOfBoundsWrapper, OrderEnforcingWrapper
 except ImportError as error:
     raise MissingDependencyError(
@@ -57,7 +59,7 @@ class CrowdEnv(AgentsEnv, KnownAgents):
         self.action_spaces = self.single_action_spaces
         self.state_space = self.single_state_space
         self.agents: list[str] = []
-        self._live: list[int] = []
+        self._live: list[bool] = []
 
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
@@ -90,19 +92,19 @@ class CrowdEnv(AgentsEnv, KnownAgents):
             over = self.action_spaces.keys() - set(self.agents)
             actions = {agent: action for agent, action in actions.items() if agent not in over}
         worlds, acted, live = self.worlds, self.agents, self._live
-        shapes = [self.action_spaces[agent].shape for agent in acted]
-        action = joined_actions(actions, acted, shapes, worlds.device)
+        action = joined_actions(actions, acted, self._shapes, worlds.device)
         with worlds.device_context():
             outcome = worlds.step(self._with_zeros(action))
-        infos, causes = self._infos(outcome.numbers), outcome.causes[0].tolist()
+        infos = self._infos(outcome.numbers)
         observations = self._by_agent(outcome.observation)
-        all_rewards, endings = outcome.rewards[0].tolist(), outcome.endings[0].tolist()
-        rewards, terminations = {}, {}
-        for k, agent in zip(live, acted, strict=True):
-            rewards[agent], terminations[agent] = all_rewards[k], endings[k] > 0
-            infos[agent]["reason"] = causes[k]
-        truncations = dict.fromkeys(acted, bool(outcome.truncated[0]))
-        self._update_agents()
+        rewards = dict(zip(acted, compress(outcome.rewards[0].tolist(), live), strict=True))
+        ended, truncated = outcome.endings[0] > 0, bool(outcome.truncated[0])
+        terminations = dict(zip(acted, compress(ended.tolist(), live), strict=True))
+        truncations = dict.fromkeys(acted, truncated)
+        if truncated or ended.any():
+            for agent, cause in zip(acted, compress(outcome.causes[0].tolist(), live), strict=True):
+                infos[agent]["reason"] = cause
+            self._update_agents()
         self._show()
         return observations, rewards, terminations, truncations, infos
 
@@ -125,8 +127,9 @@ class CrowdEnv(AgentsEnv, KnownAgents):
         return self._by_agent(observation)
 
     def _update_agents(self) -> None:
-        self._live = np.flatnonzero(self.worlds.live[0, : len(self.possible_agents)]).tolist()
-        self.agents = [self.possible_agents[k] for k in self._live]
+        self._live = self.worlds.live[0, : len(self.possible_agents)].tolist()
+        self.agents = list(compress(self.possible_agents, self._live))
+        self._shapes = [self.action_spaces[agent].shape for agent in self.agents]
 
     def _with_zeros(self, action: Tensor) -> Tensor:
         """Return all particles' actions, [1, N, A], from the live agents', [N', A], and zeros."""
@@ -134,28 +137,58 @@ class CrowdEnv(AgentsEnv, KnownAgents):
         if len(action) == count:
             return action[None]
         all_rows = action.new_zeros(1, count, action.shape[1])
-        live = np.isin(self.worlds.owner, self._live)
+        live = np.isin(self.worlds.owner, np.flatnonzero(self._live))
         all_rows[0, torch.from_numpy(live).to(action.device)] = action
         return all_rows
 
     def _infos(self, numbers: dict[str, Tensor]) -> Infos:
         """Return infos of live agents: species, no reason, and theirs of `numbers`, [1, M] each."""
-        rows = torch.stack(list(numbers.values()))[:, 0].tolist()
-        columns = dict(zip(numbers, rows, strict=True))
-        species = self.worlds.agent_species
-        return {
-            agent: {"species": int(species[k]), "reason": 0}
-            | {name: row[k] for name, row in columns.items()}
-            for k, agent in zip(self._live, self.agents, strict=True)
-        }
+        columns = torch.stack(list(numbers.values()))[:, 0].tolist()
+        species = self.worlds.agent_species.tolist()
+        rows = zip(species, [0] * len(species), *columns, strict=True)
+        # Iterators make a dict in half the time of a comprehension.
+        named = map(dict, map(zip, repeat(("species", "reason", *numbers)), compress(rows, self._live)))
+        return dict(zip(self.agents, named, strict=True))
 
     def _by_agent(self, observation: Tensor) -> dict[str, Any]:
         """Return each live agent's observation from all particles' perception, [1, N, P]."""
-        rows, spans = self._out(observation[0]), self.worlds.spans
-        return {
-            agent: rows[spans[k].start] if self.worlds.by_particle else rows[spans[k]]
-            for k, agent in zip(self._live, self.agents, strict=True)
-        }
+        rows, worlds = self._out(observation[0]), self.worlds
+        parts = rows if worlds.by_particle else [rows[span] for span in worlds.spans]
+        return dict(zip(self.agents, compress(parts, self._live), strict=True))
+
+
+class TurnsEnv(OrderEnforcingWrapper):  # type: ignore[misc]
+    """A parallel environment whose agents act in turn, with PettingZoo's checks of the order.
+
+    The world is stepped after the last agent. `clips`: actions are clipped to their box. Calls are
+    passed to PettingZoo's wrappers only if they have something to say: these are slow.
+    """
+
+    agents = property(attrgetter("_turns.agents"))
+    agent_selection = property(attrgetter("_turns.agent_selection"))
+    __str__ = ClipOutOfBoundsWrapper.__str__
+
+    def __init__(self, parallel_env: KnownAgents, *, clips: bool) -> None:
+        self._turns = turns = parallel_to_aec_wrapper(parallel_env)
+        boxes = [isinstance(turns.action_space(a), Box) for a in turns.possible_agents]
+        self._clips = clips and all(boxes)
+        super().__init__(ClipOutOfBoundsWrapper(turns) if self._clips else turns)
+
+    def last(self, observe: bool = True) -> Any:
+        """Return the next agent's observation, reward since it acted, flags and info."""
+        return self._turns.last(observe) if self._has_reset else super().last(observe)
+
+    def step(self, action: Any) -> None:
+        """Take the action of the agent whose turn it is."""
+        turns = self._turns
+        fits = self._has_reset and bool(turns.agents)
+        if fits and self._clips and action is not None:
+            fits = type(action) is np.ndarray and action.dtype == np.float32
+            fits = fits and action.shape == turns.action_space(turns.agent_selection).shape
+            # The box of all actions; not a number is outside of it.
+            fits = fits and bool(np.abs(action).max() <= 1.0)
+        self._has_updated |= fits
+        (turns.step if fits else super().step)(action)
 
 
 def in_turns(
@@ -165,13 +198,11 @@ def in_turns(
 
     def raw_env(*args: Arguments.args, **config: Arguments.kwargs) -> Any:
         """Return `parallel_env` with agents that act in turn; the world steps after the last."""
-        return parallel_to_aec(parallel_env(*args, **config))
+        return TurnsEnv(parallel_env(*args, **config), clips=False)
 
     def env(*args: Arguments.args, **config: Arguments.kwargs) -> Any:
-        """Return `raw_env` with a check of the order, and actions clipped to their box."""
-        turns = raw_env(*args, **config)
-        is_box = isinstance(turns.action_space(turns.possible_agents[0]), Box)
-        return OrderEnforcingWrapper(ClipOutOfBoundsWrapper(turns)) if is_box else turns
+        """Return `raw_env` with actions clipped to their box."""
+        return TurnsEnv(parallel_env(*args, **config), clips=True)
 
     return raw_env, env
 

@@ -42,6 +42,11 @@ class MixingTask(SpeciesTask):
         one species in the neighbourhood, 1 with equal parts of all S.
         """
         species_count = len(population.counts)
+        if population.neighbours is not None:
+            smoothed = population.neighbours.smoothed_species(population.species, species_count)
+            fractions = smoothed / smoothed.sum(dim=2, keepdim=True)
+            summed: Tensor = torch.special.entr(fractions).sum(dim=2)
+            return summed / math.log(species_count)
         indices = torch.arange(species_count, device=population.x.device)
         tags = (population.species[:, None] == indices).to(population.x)
         perceived = perceive(

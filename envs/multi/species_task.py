@@ -21,7 +21,7 @@ from npa_envs.errors import NPAError
 from npa_envs.render import STYLES
 from npa_envs.rule.rule import COLOUR_OFFSET
 from npa_envs.tasks.seeds import uniform_ball
-from npa_envs.world.environment_steps import Physics
+from npa_envs.world.environment_steps import NeighbourState, Physics
 from npa_envs.world.particles import Particles
 from npa_envs.world.randomness import WorldRandom
 
@@ -173,6 +173,8 @@ class Population(NamedTuple):
     """Remaining particles of each species in a world."""
     species: Tensor
     """Species of each particle, int64, shape [N]."""
+    neighbours: NeighbourState | None = None
+    """The particles sorted by place, if they are already; only on a CPU, and without gradients."""
 
     @property
     def spans(self) -> list[slice]:

@@ -321,6 +321,8 @@ class SpeciesWorlds(WorldState):
         endings = np.zeros(live.shape, dtype=np.uint8)
         endings[live & (self._death_step == self.elapsed[:, None])] = REMOVED
         endings[live & diverged] = LEFT
+        if not endings.any():
+            return endings
         staying = live & (endings == 0)
         for world in np.flatnonzero((live & ~staying).any(axis=1)):
             present = self.agent_species[staying[world]]
@@ -455,7 +457,7 @@ class WorldGroup:
 
     def perception(self, population: Population | None = None, *, stepped: bool = False) -> Tensor:
         """Return what particles perceive, [B', N', P]; `stepped`: with neighbours of the step."""
-        x, s, counts, _ = population or self.population
+        x, s, counts, *_ = population or self.population
         neighbours = self._neighbours if stepped else None
         rows = (neighbours or NeighbourState(x, s, self._physics)).perceive()
         if self._task.config.perception == "per_species":
@@ -464,15 +466,26 @@ class WorldGroup:
 
     def _evaluate(self) -> None:
         x, s, physics = self.population.x, self.population.s, self._physics
-        inside = (s.abs() < physics.limits.state).all(dim=-1)
+        limited = [(s, physics.limits.state)]
         # In a box positions reach the limit only by wrapping onto an edge that lies there.
         if physics.boundary == "open":
-            inside &= (x.abs() < physics.limits.position).all(dim=-1)
-        # Sums of ones are exact in any order.
-        count = torch.zeros(len(inside), self._agent_count, device=inside.device)
-        self.diverged = count.index_add_(1, self._owners, inside.float()) == 0.0
-        self.terms = self.loss_terms()
-        self._neighbours = NeighbourState(x, s, physics)
+            limited.append((x, physics.limits.position))
+        # A CPU can see that all are inside; CUDA would have to wait for it.
+        if not x.is_cuda and all(np.abs(v.numpy()).max() < limit for v, limit in limited):
+            self.diverged.zero_()
+        else:
+            inside = (s.abs() < physics.limits.state).all(dim=-1)
+            for values, limit in limited[1:]:
+                inside &= (values.abs() < limit).all(dim=-1)
+            # Sums of ones are exact in any order.
+            count = torch.zeros(len(inside), self._agent_count, device=inside.device)
+            self.diverged = count.index_add_(1, self._owners, inside.float()) == 0.0
+        if x.is_cuda or self._neighbours is None:
+            self.terms = self.loss_terms()
+            self._neighbours = NeighbourState(x, s, physics)
+        else:
+            self._neighbours.update()
+            self.terms = self.loss_terms(self.population._replace(neighbours=self._neighbours))
 
 
 def population_of(

@@ -23,7 +23,7 @@ from npa_envs.checks import (
     checked_flag,
 )
 from npa_envs.ops.custom_op import check_derivatives, custom_op, once_differentiable
-from npa_envs.ops.launch import RecordedLaunches, is_aligned, launch
+from npa_envs.ops.launch import RecordedLaunches, channel_width, is_aligned, launch
 from npa_envs.ops.perception_passes import (
     SavedPerception,
     compute_densities,
@@ -364,7 +364,7 @@ def updates_in_parts(
 
 
 class NeighbourState:
-    """Worlds x and s, unchecked, sorted into cells with densities; they must not change.
+    """Worlds x and s, unchecked, sorted into cells with densities; changes need an `update`.
 
     `world_indices`, int64, shape [B], are the worlds' indices in a larger batch, into which
     perception is written; None: the worlds are the whole batch.
@@ -373,9 +373,16 @@ class NeighbourState:
     def __init__(
         self, x: Tensor, s: Tensor, physics: Physics, world_indices: Tensor | None = None
     ) -> None:
+        self._worlds = x, s, world_indices
+        self._shape = *x.shape[:2], physics.perception_dim
+        sizes = x.shape, s.shape[2], x.shape[:2].numel()
+        self._plan = plan_kernels(x, *sizes, False, physics, for_environments=True)
+        self._sorting: RecordedLaunches | None = None
+        self._sort()
+
+    def _sort(self) -> None:
+        plan, (x, s, world_indices) = self._plan, self._worlds
         x, s = x.contiguous(), s.contiguous()
-        total = x.shape[0] * x.shape[1]
-        plan = plan_kernels(x, x.shape, s.shape[2], total, False, physics, for_environments=True)
         with_lists = plan.lists_neighbours
         in_place = with_lists and plan.state_dim % plan.width == 0 and is_aligned(s)
         ordered = sort_worlds(plan, x, None if in_place else s, None, with_rows=not with_lists)
@@ -397,12 +404,26 @@ class NeighbourState:
             densities,
             states=s if in_place else None,
             destination=destination,
-            limit=physics.limits.perception,
+            limit=plan.physics.limits.perception,
         )
-        self._shape = *x.shape[:2], physics.perception_dim
-        self._like = x
+        self._sorted = ordered, densities
+        self._smoothing: tuple[Tensor, Tensor, Tensor, RecordedLaunches] | None = None
         self._perceived = False
         self._recorded: RecordedLaunches | None = None
+
+    def update(self) -> None:
+        """Sort contiguous worlds, the whole batch, again after they changed in place.
+
+        Later calls for small worlds on a CPU take less time.
+        """
+        if self._sorting is not None:
+            self._sorting.replay()
+        elif self._plan.runs("sort") == "world":
+            self._sorting = RecordedLaunches()
+            with self._sorting.recording():
+                self._sort()
+        else:
+            self._sort()
 
     def perceive(self, out: Tensor | None = None) -> Tensor:
         """Return every particle's perception, clipped to `Limits.perception`, shape [B, N, P].
@@ -411,7 +432,7 @@ class NeighbourState:
         tensor. Later calls take less CPU time.
         """
         if out is None:
-            out = self._like.new_empty(self._shape)
+            out = self._worlds[0].new_empty(self._shape)
         rows = out.view(-1, self._shape[-1])
         if not self._perceived:
             # Many worlds are perceived once: recorded launches would cost more than they save.
@@ -427,3 +448,28 @@ class NeighbourState:
         self._recorded.move(self._slots, rows)
         self._recorded.replay()
         return out
+
+    def smoothed_species(self, species: Tensor, species_count: int) -> Tensor:
+        """Return tags of each species, smoothed as `perceive` smooths states, [B, N, S].
+
+        A tag is 1 for particles of its species, int64 [N], and 0 for others; only on a CPU. Later
+        calls, for the same species, overwrite the result and take less CPU time.
+        """
+        ordered, densities = self._sorted
+        if self._smoothing is None:
+            assert self._plan.on_cpu, "CUDA's lists of neighbours are of the worlds' states"
+            width = channel_width(species_count)
+            physics = self._plan.physics._replace(terms=Terms(False, None, False))
+            plan = self._plan._replace(state_dim=species_count, width=width, physics=physics)
+            tags = (species[:, None] == torch.arange(plan.group_count * width)).to(densities[0])
+            tags = tags.repeat(plan.world_count, 1)
+            states, out = torch.empty_like(tags), tags.new_empty(plan.total, 2 * species_count)
+            ordered, destination = ordered._replace(states=states), ordered.original_index
+            recorded = RecordedLaunches()
+            recorded.add(*perception_launch(plan, ordered, densities, out, destination=destination))
+            smoothed = out.view(*self._shape[:2], -1)[..., species_count:]
+            self._smoothing = tags, states, smoothed, recorded
+        tags, states, smoothed, recorded = self._smoothing
+        torch.index_select(tags, 0, ordered.original_index, out=states)
+        recorded.replay()
+        return smoothed

@@ -292,6 +292,7 @@ PARTICLES = [
         acting(lambda a: a | {"particle_7": np.zeros((1, 18))}),
         r"'particle_7'\] must be real numbers of shape \(18,\)",
     ),
+    (filled("particle_7", 17, np.nan), r"'particle_7'\] must be finite, got nan \(1 such"),
 ]
 BRUSHES = r"action must be real numbers of shape \[J,? W\]"
 GARDENERS = [

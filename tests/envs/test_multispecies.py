@@ -1,5 +1,7 @@
 """Species and particles as agents: turns, deaths, opponents, pictures, PettingZoo's tests."""
 
+from copy import deepcopy
+
 import numpy as np
 import pettingzoo
 import pytest
@@ -33,6 +35,18 @@ def test_turns_clip_actions_and_lead_to_the_same_world_as_acting_at_once(recwarn
             assert np.array_equal(turns.observe(agent), observations[agent])
             assert turns.rewards[agent] == rewards[agent]
     assert turns.truncations == {"species_0": True, "species_1": True}
+
+
+def test_turns_are_checked_as_pettingzoo_checks_them():
+    turns = particles_v0.env(**few("mixing"))
+    assert not hasattr(turns, "agents")
+    for call in (turns.render, turns.state, turns.agent_iter, lambda: turns.step(None)):
+        with pytest.raises(AssertionError, match=r"reset\(\) needs to be called"):
+            call()
+    turns.reset(seed=0)
+    for width, value, message in ((18, np.nan, "a nan action"), (17, 0.0, "should have shape")):
+        with pytest.raises(AssertionError, match=message):
+            turns.step(np.full(width, value, np.float32))
 
 
 def test_species_have_spaces_of_their_own_sizes_and_the_state_shows_all():
@@ -279,6 +293,16 @@ def test_particles_of_a_removed_species_end_together():
     assert all(rewards.values())
 
 
+def test_losses_of_particles_are_of_the_world_as_it_is_also_after_deaths():
+    env = begun(crowd(species_count=3, deaths=((1, 3),), max_cycles=7))
+    for step in range(6):
+        *_, infos = env.step(drawn(env, np.random.default_rng(step)))
+        # The losses of the step of a death are those before it.
+        if step != 2:
+            losses = env.worlds.task.particle_losses(env.worlds.population(0))["separation"]
+            assert [info["loss"] for info in infos.values()] == losses[0].tolist()
+
+
 # PettingZoo's own tests
 
 
@@ -288,6 +312,45 @@ KINDS = {"species": (multispecies_v0, small), "particle": (particles_v0, few)}
 """Modules by what their agents are called, and keywords of small worlds."""
 
 every_kind = pytest.mark.parametrize("kind", KINDS)
+
+
+@every_kind
+@pytest.mark.parametrize("form", [np.ndarray.tolist, np.float64, np.float16, torch.from_numpy])
+def test_actions_of_any_form_and_order_lead_to_the_same_world(form, kind):
+    module, keywords = KINDS[kind]
+    envs = [begun(module.parallel_env(**keywords("mixing")), seed=3) for _ in range(2)]
+    # In halves, which all types have.
+    drawings = drawn(envs[0], np.random.default_rng(0))
+    actions = {agent: np.round(2.0 * action) / 2.0 for agent, action in drawings.items()}
+    envs[0].step(actions)
+    envs[1].step({agent: form(action) for agent, action in reversed(actions.items())})
+    assert np.array_equal(envs[0].state(), envs[1].state())
+
+
+@every_kind
+def test_results_are_plain_and_do_not_change_when_a_caller_keeps_them(kind):
+    module, keywords = KINDS[kind]
+    settings, generator = keywords("mixing", max_cycles=8), np.random.default_rng(0)
+    env, turns = module.parallel_env(**settings), module.env(**settings)
+    kept, observed = [env.reset(seed=0)], []
+    turns.reset(seed=0)
+    copies = deepcopy(kept)
+    while env.agents:
+        actions = drawn(env, generator)
+        for agent in env.agents:
+            observed.append(turns.observe(agent))
+            turns.step(actions[agent].copy())
+        kept.append(env.step(actions))
+        copies.append(deepcopy(kept[-1]))
+        # Nor does the world read an action later.
+        for action in actions.values():
+            action[:] = 1.0
+        _, *values, infos = kept[-1]
+        assert [{type(v) for v in part.values()} for part in values] == [{float}, {bool}, {bool}]
+        assert {type(v) for info in infos.values() for v in info.values()} <= {int, float, str}
+    np.testing.assert_equal(kept, copies)
+    seen = [observation for outcome in kept[:-1] for observation in outcome[0].values()]
+    assert all(map(np.array_equal, observed, seen))
 
 
 @every_kind

@@ -181,6 +181,22 @@ def test_observation_is_perception_in_the_callers_order_and_clipped(
         assert relative_error(out, expected.clamp(-1.5, 1.5)) < FORWARD[dtype]
 
 
+@pytest.mark.parametrize(("count", "tagged"), [(133, 18), (4200, 2)])
+def test_worlds_that_changed_are_perceived_as_they_are_after_an_update(count, tagged, device):
+    """Exactly; small worlds on a CPU repeat the launches of the first update."""
+    x, s = random_world(3, count, 2, 16, dtype=torch.float32, device=device)
+    neighbours, species = observed(x, s), torch.arange(count, device=device) % tagged
+    tags = torch.nn.functional.one_hot(species).to(x).repeat(3, 1, 1)
+    for _ in range(3):
+        x.copy_(0.9 * x.roll(5, dims=1))
+        s.copy_(s.roll(1, dims=2))
+        neighbours.update()
+        assert torch.equal(neighbours.perceive(), observed(x, s).perceive())
+        if device.type == "cpu":
+            smoothed = npa_envs.perceive(x, tags, 0.2)[..., tagged : 2 * tagged]
+            assert torch.equal(neighbours.smoothed_species(species, tagged), smoothed)
+
+
 def answers(x, s, bars):
     """Return perception of environments and of rollouts, with its gradients, open and in a box."""
     results = [observed(x, s).perceive()]
