@@ -147,7 +147,8 @@ class CrowdEnv(AgentsEnv, KnownAgents):
         species = self.worlds.agent_species.tolist()
         rows = zip(species, [0] * len(species), *columns, strict=True)
         # Iterators make a dict in half the time of a comprehension.
-        named = map(dict, map(zip, repeat(("species", "reason", *numbers)), compress(rows, self._live)))
+        names = "species", "reason", *numbers
+        named = map(dict, map(zip, repeat(names), compress(rows, self._live)))
         return dict(zip(self.agents, named, strict=True))
 
     def _by_agent(self, observation: Tensor) -> dict[str, Any]:
