@@ -19,7 +19,7 @@ from npa_envs.ops.pictures.cameras import orbit
 from npa_envs.ops.pictures.gaussians import render_gaussians
 from npa_envs.ops.pictures.splat import picture_losses, splat
 from npa_envs.ops.pictures.triangles import nearest_triangles
-from npa_envs.ops.random_numbers import draw
+from npa_envs.ops.random_numbers import draw, mixed_keys
 from npa_envs.ops.rewards_and_ends import EpisodeRules, EpisodeUpdate
 from npa_envs.ops.static_worlds import prepare_static, static_rows
 from npa_envs.ops.update import ActedWorlds, PreparedActions, update_particles
@@ -52,6 +52,7 @@ def warmup(
     streams = keys, counts, counts, 0
     draw(*streams, "bernoulli", 1, torch.uint8, 1)
     draw(*streams, "integers", 1, torch.int64, 2)
+    mixed_keys(keys, 0)
     _warm_rewards(counts)
     for dtype in dtypes:
         draw(*streams, "uniform", 1, dtype, 0)

@@ -191,7 +191,7 @@ class RuleStep(Step):
         filled = [count for count in counts if count > 0]
         if not self.world_by_world or len(filled) < 2:
             return network(perception)
-        return torch.cat([network(rows) for rows in perception.split(filled)])
+        return torch.cat([network(rows) for rows in torch.split(perception, filled)])
 
     def advance(self, particles: Particles, draws: Draws) -> Particles:
         """Return the worlds after one step with these random numbers."""
