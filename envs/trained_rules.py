@@ -127,9 +127,8 @@ def run_rule(
     constants = {name: getattr(config, name) for name in names} | changes
     # A world is the same in every batch; on CUDA it is anyway.
     alone = particles.x.device.type == "cpu" and not torch.is_grad_enabled()
-    return rollout_particles(
-        rule, particles, steps, generator=random, world_by_world=alone, **constants
-    )
+    constants |= {"generator": random, "world_by_world": alone}
+    return rollout_particles(rule, particles, steps, **constants)
 
 
 def grow(

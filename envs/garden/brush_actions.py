@@ -187,8 +187,7 @@ def apply_brushes(
     if config.actions == "grid":
         grid = grid_places(config, x.device).to(x) if grid is None else grid
         # Several agents may each have a brush at every place.
-        agents = action.shape[1] // len(grid)
-        places = grid if agents == 1 else grid.repeat(agents, 1)
+        places = grid.repeat(action.shape[1] // len(grid), 1)
     # What all brushes do to a particle is a sum over the brushes near it.
     total = sums_under_brushes(x, middle[:, None] + places, action, **brush_options(config))
     if "push" in config.tools:
