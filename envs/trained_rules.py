@@ -32,7 +32,10 @@ FIRST_TEST_SEED = 1_000_000
 """Seed of the first world of the "test" pool, and the largest size of a pool."""
 
 
-OF_PARTICLES = {"tell_updated": "where actions do not belong to particles"}
+OF_PARTICLES = {
+    "tell_updated": "where actions do not belong to particles",
+    "control": "where a rule steps the particles",
+}
 """Fields of `WorldConfig.fixed` for worlds that a rule steps."""
 
 

@@ -13,7 +13,7 @@ from gymnasium.wrappers.vector import FlattenObservation, TransformAction
 from npa_envs.envs import multispecies_v0, particles_v0
 from npa_envs.envs.core.vector import checked_count
 from npa_envs.errors import NPAError, importing, shown, suggest
-from npa_envs.registration import ALL, CODED, GARDEN_IDS, SPECIES_SIZES
+from npa_envs.registration import ALL, CENTRAL, CODED, GARDEN_IDS, SPECIES_SIZES
 from npa_envs.wrappers.base import AnyVectorEnv, ParticleRows, vector_env
 
 with importing("Ray", "training with RLlib", "pip install 'npa-envs[rllib]'"):
@@ -30,7 +30,7 @@ MAKERS = {
 
 ROW_IDS = tuple(row.id for row in ALL)
 
-WHOLE_IDS = frozenset((*GARDEN_IDS, *(row.id for row in CODED)))
+WHOLE_IDS = frozenset((*GARDEN_IDS, *(row.id for row in (*CODED, *CENTRAL))))
 """Ids of environments whose actions are for a whole world."""
 
 

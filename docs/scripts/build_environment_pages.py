@@ -39,7 +39,15 @@ from npa_envs.envs.core.single import NPAEnv
 from npa_envs.envs.core.vector import NPAVectorEnv
 from npa_envs.envs.garden.base import GardenEnv
 from npa_envs.envs.trained_rules import RuleDrivenWorlds
-from npa_envs.registration import CODED, ENVIRONMENTS, GARDENS, SIZES, SMALL, Registration
+from npa_envs.registration import (
+    CENTRAL,
+    CODED,
+    ENVIRONMENTS,
+    GARDENS,
+    SIZES,
+    SMALL,
+    Registration,
+)
 
 DOCS = Path(__file__).resolve().parents[1]
 PAGES = DOCS / "environments"
@@ -141,7 +149,7 @@ def argument_tables(config_type: type[EnvConfig]) -> str:
 def small_forms(registration: Registration) -> str:
     """Return what ids with other keywords there are of an environment, Markdown."""
     told = ""
-    for small in (*SMALL, *SIZES):
+    for small in (*SMALL, *SIZES, *CENTRAL):
         if small.name == registration.name:
             given = ", ".join(
                 f"`{name}={default_text(value).strip('`')}`"
