@@ -167,7 +167,7 @@ class PointClassificationEnv(NPAEnv):
     |---|---|---|---|
     | `0 : C` | change of the state | `state_scale`, no unit | s ← s + dt `state_scale` a |
 
-    The rest is as in `npa/Morphogenesis2D-v0`.
+    The rest is as in `npa/Morphogenesis2D-v0`. The square of central control is [0, 1] × [0, 1].
 
     ## Reward
 

@@ -68,6 +68,7 @@ ONCE = {
     "Reward": "The values of `reward` mean the same in [every environment]({page}#reward).",
     "Starting state": "Seeds are those of [every environment]({page}#starting-state).",
     "Episode end": "Causes and reasons are those of [every environment]({page}#episode-end).",
+    "Central control": "`control=\"central\"` is as in [every environment]({page}#central-control).",
     "Rendering": "Modes and styles are those of [every environment]({page}#rendering).",
     "Vectorized environment": "Batches of worlds and the arguments of `gym.make_vec` are those of "
     "[every environment]({page}#vectorized-environment).",
@@ -91,6 +92,8 @@ def resolved_sections(env_class: type) -> dict[str, str]:
     own = sections(env_class)
     first = sections(environment_class(FIRST))
     shared = sections(NPAEnv)
+    if "control" in env_class.task_type.config_type.fixed:
+        del shared["Central control"]
     order = [name for name in (first | shared) if name]
     if env_class.task_type.worlds_type is RuleDrivenWorlds:
         # They pay and tell otherwise; all else that they do not say is said of all environments.

@@ -313,8 +313,8 @@ class EnvConfig(WorldConfig):
     reward is "sparse", except by `make_vec`, which has `max_episode_steps`."""
 
     control: Control = "particles"
-    """What acts: "particles", by a row each; or "central", one controller that observes a coarse
-    picture and acts by few numbers, at the places of a grid."""
+    """Who acts: "particles", by a row each; or "central", one controller of few numbers, see the
+    section Central control."""
 
     place_count: int = 4
     """Places P on each side of the grid, where control is "central"; 1: one action for all
