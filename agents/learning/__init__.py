@@ -190,7 +190,8 @@ def _checked_function(
     if problem.controlled in UNLEARNED and method in GARDEN_METHODS | METHODS:
         raise NPAError(
             f"method {shown(method)} cannot learn {UNLEARNED[problem.controlled]}, the actions of "
-            f"{problem.env_id}: give a function of your own, 'package.module:function', or take another library"
+            f"{problem.env_id}: give a function of your own, 'package.module:function', or take "
+            "another library"
         )
     function = _function(method, methods_for(problem))
     known = _options_of(function)

@@ -68,7 +68,7 @@ ONCE = {
     "Reward": "The values of `reward` mean the same in [every environment]({page}#reward).",
     "Starting state": "Seeds are those of [every environment]({page}#starting-state).",
     "Episode end": "Causes and reasons are those of [every environment]({page}#episode-end).",
-    "Central control": "`control=\"central\"` is as in [every environment]({page}#central-control).",
+    "Central control": "It is as in [every environment]({page}#central-control).",
     "Rendering": "Modes and styles are those of [every environment]({page}#rendering).",
     "Vectorized environment": "Batches of worlds and the arguments of `gym.make_vec` are those of "
     "[every environment]({page}#vectorized-environment).",

@@ -375,10 +375,10 @@ class CentralWorlds(ParticleWorlds):
         if not bool(torch.isfinite(action).all()):
             raise not_finite(action)
         size = self.task.config.place_count
-        grid = action.to(self.device).unflatten(1, (size, size)).permute(0, 3, 1, 2)
-        where = self._in_square()[:, :, None]
-        rows = F.grid_sample(grid, where, padding_mode="border", align_corners=True)
-        self.steps.act(rows[..., 0].transpose(1, 2).contiguous())
+        rows = action.to(self.device).reshape(self.world_count, size, size, -1)
+        grid, where = rows.permute(0, 3, 1, 2), self._in_square()[:, :, None]
+        sampled = F.grid_sample(grid, where, padding_mode="border", align_corners=True)
+        self.steps.act(sampled[..., 0].transpose(1, 2).contiguous())
         return self.perceive(out)
 
     @torch.no_grad()
@@ -398,8 +398,8 @@ class CentralWorlds(ParticleWorlds):
 
     def _in_square(self) -> Tensor:
         """Return positions, [B, N, 2], where the square of pictures and places is [-1, 1]²."""
-        task = self.task
-        return ((self.x - task.place_middle) / task.config.place_reach).clamp(-1.0, 1.0)
+        scaled: Tensor = (self.x - self.task.place_middle) / self.task.config.place_reach
+        return scaled.clamp(-1.0, 1.0)
 
     restart = BatchedWorlds.restart
     host_observation = BatchedWorlds.host_observation
