@@ -71,3 +71,23 @@ def test_the_small_forms_are_for_other_libraries_learners(row):
     problem = Problem(env_id=row.id, episode_steps=4)
     assert problem.controlled == "central"
     assert methods_for(problem) == {}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("row", CENTRAL, ids=lambda row: row.id)
+def test_another_librarys_ppo_learns_with_its_own_settings(row):
+    sb3 = pytest.importorskip("stable_baselines3")
+    env = gymnasium.make(row.id)
+    model = sb3.PPO("MlpPolicy", env, seed=0, device="cpu").learn(12_288)
+    returns = []
+    for seed in range(1000, 1008):
+        observation, _ = env.reset(seed=seed)
+        returns.append(0.0)
+        over = False
+        while not over:
+            action, _ = model.predict(observation, deterministic=True)
+            observation, reward, terminated, truncated, _ = env.step(action)
+            returns[-1] += reward
+            over = terminated or truncated
+    # Without actions a return is 0, and random ones get 0.05 and -0.3.
+    assert np.mean(returns) > 0.2
