@@ -109,6 +109,9 @@ CENTRAL = tuple(
 """Small variants with one controller of few numbers in place of an action for each particle, which
 learners take as they are. Settings never change under the same version."""
 
+WORLD_IDS = frozenset((*GARDEN_IDS, *(row.id for row in (*CODED, *CENTRAL))))
+"""Ids whose actions are of a whole world, not of particles."""
+
 ALL = (*ENVIRONMENTS, *GARDENS, *CODED, *SMALL, *SIZES, *CENTRAL)
 """All entries that are registered with Gymnasium."""
 
