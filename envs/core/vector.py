@@ -216,12 +216,12 @@ class NPAVectorEnv(WorldsEnv, BatchedSpaces):
         return rows[0], terminated, truncated, infos
 
     def _returned_values(self, values: dict[str, Tensor], *, copy: bool = True) -> dict[str, Any]:
-        # As Python's numbers, which a single environment has, arrays [B] are float64.
-        wide = {n: v.double() if self._is_number(v) else v for n, v in values.items()}
-        return {n: self._out(v.clone() if copy and v is values[n] else v) for n, v in wide.items()}
-
-    def _is_number(self, value: Tensor) -> bool:
-        return self.config.output == "numpy" and value.ndim == 1 and value.is_floating_point()
+        """Return values by name, [B, ...] each, as `config.output`; numbers as float64 arrays."""
+        found = {n: self._out(v.clone() if copy else v) for n, v in values.items()}
+        if self.config.output == "torch":
+            return found
+        of_numbers = [n for n, v in found.items() if v.ndim == 1 and v.dtype == np.float32]
+        return found | {n: found[n].astype(np.float64) for n in of_numbers}
 
     def _report_rows(self, report: StepReport) -> Sequence[Any]:
         """Return the rows of `report.numbers`, [B] each, as tensors or float64 arrays."""

@@ -15,6 +15,7 @@ from npa_envs.envs.core.task import Start
 from npa_envs.envs.garden.brush_actions import (
     OBSERVATION_LIMIT,
     VALUES_PER_PLACE,
+    BrushLayout,
     BrushSpaces,
     GardenConfig,
     apply_brushes,
@@ -110,7 +111,11 @@ class GardenTask(RuleDrivenTask[Config], GrownTask[Config]):
     def step(
         self, x: Tensor, s: Tensor, action: Tensor, random: WorldRandom
     ) -> tuple[Tensor, Tensor]:
-        """Return x and s after brushes, steps of the rule and `disturb`; differentiable."""
+        """Return x and s after brushes, steps of the rule and `disturb`; differentiable.
+
+        `action` has J rows of W columns for each world, [B, J, W] or [B, J W].
+        """
+        action = action.reshape(len(x), -1, BrushLayout.for_config(self.config).width)
         x, s, *_ = self.disturb(self.brush_and_roll(Particles(x, s), action, random), random)
         return x, s
 
@@ -238,6 +243,11 @@ class GardenEnv(NPAEnv):
     channel up or down, rate 0, rate 2, as far as `tools` has them); and its strength, one of
     `strength_count`.
 
+    ## Version history
+
+    - v0: first version. Actions of preliminary versions were rows, as with
+      `action_shape="brushes"`; worlds, rewards and returns are the same.
+
     ## Info
 
     | Key | In | Value |
@@ -252,9 +262,4 @@ class GardenEnv(NPAEnv):
 
     As in [every environment](Morphogenesis2D.md#vectorized-environment), but on a CPU worlds are
     stepped one by one: a batch saves no time there.
-
-    ## Version history
-
-    - v0: first version. Actions of preliminary versions were rows, as with
-      `action_shape="brushes"`; worlds, rewards and returns are the same.
     """

@@ -177,12 +177,11 @@ def apply_brushes(
     """Return particles after all brushes at once, whose effects add up, and rates; differentiable.
 
     A rate multiplies a particle's change in each step of the rule, dimensionless, [B, N, 1]; None
-    without the tool "rate". `action` has a row for each brush, [B, J, W] or [B, J W]; `middle`,
-    [B, 2], is the origin of places.
+    without the tool "rate". `action` has a row for each brush, [B, J, W]; `middle`, [B, 2], is the
+    origin of places.
     """
     x, s, *_ = particles
-    columns = BrushLayout.for_config(config)
-    action = action.reshape(len(x), -1, columns.width).clamp(-1.0, 1.0)
+    columns, action = BrushLayout.for_config(config), action.clamp(-1.0, 1.0)
     places = action[..., columns.place]
     if config.actions == "grid":
         places = grid_places(config, x.device).to(x)

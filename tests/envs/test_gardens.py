@@ -433,7 +433,7 @@ def test_slowed_particles_cross_the_edge_of_a_periodic_box_by_the_shortest_way()
     worlds, task = envs.unwrapped.worlds, envs.unwrapped.worlds.task
     before = worlds.particles._replace(x=worlds.particles.x + 1.0)
     before = before._replace(x=before.x - 2.0 * (before.x / 2.0).round())
-    action = torch.full((2, *envs.single_action_space.shape), -0.5)
+    action = torch.full((2, *envs.unwrapped.spaces.rows_shape), -0.5)
     after = task.brush_and_roll(before, action, worlds.random)
     moved = after.x - before.x
     moved -= 2.0 * (moved / 2.0).round()

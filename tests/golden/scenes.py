@@ -274,7 +274,9 @@ def crowd(module, task, **keywords):
     generator = np.random.default_rng(14)
     observations, infos = env.reset(seed=5)
     seen, ends = [], []
-    reports = [np.array([floats(infos[agent]) for agent in env.agents], np.float32).ravel()]
+    # At the start nothing has been gained.
+    lost = [{n: v for n, v in infos[a].items() if n.startswith("loss")} for a in env.agents]
+    reports = [np.array([floats(info) for info in lost], np.float32).ravel()]
     for _ in range(10):
         if not env.agents:
             break

@@ -50,6 +50,8 @@ def flat(value, name, into):
             flat(part, f"{name}/{k}", into)
     elif value is not None:
         array = np.asarray(value)
+        if array.dtype == object and all(isinstance(part, np.ndarray) for part in array.flat):
+            array = np.stack(array)
         into[name] = array.astype(str) if array.dtype == object else array
 
 
