@@ -33,6 +33,7 @@ class Morphogenesis3DEnvConfig(EnvConfig):
     """`EnvConfig` with fields of `Morphogenesis3DConfig`, which documents most of them."""
 
     task_config_type = Morphogenesis3DConfig
+    fixed = EnvConfig.fixed | {"control": "in 3D"}
 
     eps: float = 0.3
     eps0: float = 0.3

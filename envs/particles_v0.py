@@ -10,11 +10,17 @@ from typing import Any
 from npa_envs.envs.core.config import as_python
 from npa_envs.envs.multi.parallel import CrowdEnv, in_turns, register
 from npa_envs.envs.multi.shipped_tasks import task_type
+from npa_envs.envs.multispecies_v0 import settings
 from npa_envs.errors import NPAError
-from npa_envs.registration import SPECIES
+from npa_envs.registration import SPECIES, SPECIES_SIZES
 
 ENVIRONMENTS = {name.replace("-v0", "Particles-v0"): task for name, task in SPECIES.items()}
 """Names of tasks by the ids that `pettingzoo.make` takes."""
+
+SMALL = {
+    row.id.replace("Small", "ParticlesSmall"): row.id for row in SPECIES_SIZES if "Small" in row.id
+}
+"""Ids of small worlds by the ids that `pettingzoo.make` takes."""
 
 PARTICLE_COUNT = 64
 """Default number of particles."""
@@ -41,8 +47,9 @@ class ParticlesEnv(CrowdEnv):
     | `"invasion"` | `npa/InvasionParticles-v0` |
     | `"symbiosis"` | `npa/SymbiosisParticles-v0` |
 
-    The ids are for `pettingzoo.make`, of PettingZoo 1.27 or newer, once
-    `npa_envs.envs.particles_v0` is imported.
+    `npa/SegregationParticlesSmall-v0` and so on have the settings of `npa/SegregationSmall-v0`. A
+    policy that all particles share learns there by the defaults of PPO. The ids are for
+    `pettingzoo.make`, of PettingZoo 1.27 or newer, once `npa_envs.envs.particles_v0` is imported.
 
     ## Observation space
 
@@ -104,18 +111,21 @@ class ParticlesEnv(CrowdEnv):
         super().__init__(task, config, by_particle=True)
 
 
-def parallel_env(task: str = "mixing", species_count: int = 2, **config: Any) -> ParticlesEnv:
+def parallel_env(
+    task: str = "mixing", species_count: int | None = None, **config: Any
+) -> ParticlesEnv:
     """Return an environment in which all particles act at once.
 
-    Arguments are those of `multispecies_v0.parallel_env`, except that `task` cannot be an id.
+    Arguments are those of `multispecies_v0.parallel_env`.
     """
-    if not as_python(config.get("particle_counts")):
-        config.setdefault("particle_count", PARTICLE_COUNT)
-    return ParticlesEnv(task, species_count=species_count, **config)
+    keywords = settings(task, species_count, config)
+    if not as_python(keywords.get("particle_counts")):
+        keywords.setdefault("particle_count", PARTICLE_COUNT)
+    return ParticlesEnv(**keywords)
 
 
 raw_env, env = in_turns(parallel_env)
 
 
-for _id, _task in ENVIRONMENTS.items():
+for _id, _task in (ENVIRONMENTS | SMALL).items():
     register(_id, __name__, {"task": _task})

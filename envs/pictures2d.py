@@ -28,6 +28,7 @@ CHANNELS = 4
 class Pictures2DEnvConfig(PictureConfig):
     """`PictureConfig` with several targets, and whether observations show them."""
 
+    fixed = PictureConfig.fixed | {"control": "where targets differ"}
     choices = EnvConfig.choices | {"split": get_args(Split)}
 
     targets: tuple[str, ...] = ("butterfly", "flower", "gecko", "heart", "octopus")

@@ -47,6 +47,7 @@ class PointClassificationEnvConfig(EnvConfig):
     stretch: float = PointClassificationConfig.stretch
     jitter: float = PointClassificationConfig.jitter
     overflow_weight: float = PointClassificationConfig.overflow_weight
+    place_reach: float = 0.5
 
     split: Split = "train"
     """Split of the data: "train", or "test", whose clouds are not augmented."""
@@ -83,6 +84,7 @@ class PointClassificationTask(TargetEnvTask[PointClassificationEnvConfig]):
     config_type = PointClassificationEnvConfig
     task: PointClassification
     static = True
+    place_middle = 0.5
 
     def _make_task(self) -> PointClassification:
         config, device = self.config, self.device
@@ -165,7 +167,7 @@ class PointClassificationEnv(NPAEnv):
     |---|---|---|---|
     | `0 : C` | change of the state | `state_scale`, no unit | s ← s + dt `state_scale` a |
 
-    The rest is as in `npa/Morphogenesis2D-v0`.
+    The rest is as in `npa/Morphogenesis2D-v0`. The square of central control is [0, 1] × [0, 1].
 
     ## Reward
 

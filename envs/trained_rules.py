@@ -36,7 +36,10 @@ FIRST_TEST_SEED = 1_000_000
 STEPPED_TOGETHER = 4096
 """Maximum number of particles that a CPU steps together, if they are of several worlds."""
 
-OF_PARTICLES = {"tell_updated": "where actions do not belong to particles"}
+OF_PARTICLES = {
+    "tell_updated": "where actions do not belong to particles",
+    "control": "where a rule steps the particles",
+}
 """Fields of `WorldConfig.fixed` for worlds that a rule steps."""
 
 

@@ -93,7 +93,26 @@ SIZES = (
 """Variants with few particles, in which PPO learns within minutes on a laptop, and with many, for a
 GPU. Settings never change under the same version."""
 
-ALL = (*ENVIRONMENTS, *GARDENS, *CODED, *SMALL, *SIZES)
+_CENTRAL: Mapping[str, Mapping[str, Any]] = {
+    "npa/Morphogenesis2DSmall-v0": {},
+    "npa/PointClassificationSmall-v0": {"place_count": 1},
+}
+
+CENTRAL = tuple(
+    Registration(
+        row.name, row.max_episode_steps, "CentralSmall", **row.keywords, control="central",
+        **_CENTRAL[row.id],
+    )
+    for row in SIZES
+    if row.id in _CENTRAL
+)  # fmt: skip
+"""Small variants with one controller of few numbers in place of an action for each particle, which
+learners take as they are. Settings never change under the same version."""
+
+WORLD_IDS = frozenset((*GARDEN_IDS, *(row.id for row in (*CODED, *CENTRAL))))
+"""Ids whose actions are of a whole world, not of particles."""
+
+ALL = (*ENVIRONMENTS, *GARDENS, *CODED, *SMALL, *SIZES, *CENTRAL)
 """All entries that are registered with Gymnasium."""
 
 SPECIES = {

@@ -13,7 +13,7 @@ from gymnasium.wrappers.vector import FlattenObservation, TransformAction
 from npa_envs.envs import multispecies_v0, particles_v0
 from npa_envs.envs.core.vector import checked_count
 from npa_envs.errors import NPAError, importing, shown, suggest
-from npa_envs.registration import ALL, CODED, GARDEN_IDS, SPECIES_SIZES
+from npa_envs.registration import ALL, SPECIES_SIZES, WORLD_IDS
 from npa_envs.wrappers.base import AnyVectorEnv, ParticleRows, vector_env
 
 with importing("Ray", "training with RLlib", "pip install 'npa-envs[rllib]'"):
@@ -30,15 +30,12 @@ MAKERS = {
 
 ROW_IDS = tuple(row.id for row in ALL)
 
-WHOLE_IDS = frozenset((*GARDEN_IDS, *(row.id for row in CODED)))
-"""Ids of environments whose actions are for a whole world."""
-
 
 def _make_rows(name: str, keywords: dict[str, Any]) -> AnyVectorEnv:
     """Make the vector environment called `name`, with `keywords["num_envs"]` rows, for RLlib."""
     fields = dict(keywords)
     row_count = fields.pop("num_envs")
-    if name not in WHOLE_IDS:
+    if name not in WORLD_IDS:
         return ParticleRows(_worlds(name, row_count // fields["particle_count"], fields))
     # RLlib's networks need flat observations and actions.
     worlds = _worlds(name, row_count, fields)
@@ -108,7 +105,7 @@ def rllib_rows_config(name: str, *, world_count: int = 4, **keywords: Any) -> PP
     _check_id(name, ROW_IDS, MAKERS, "rllib_config")
     rows = checked_count("world_count", world_count)
     world = _worlds(name, 1, keywords)
-    if name not in WHOLE_IDS:
+    if name not in WORLD_IDS:
         keywords["particle_count"] = vector_env(world, "rllib_rows_config").config.particle_count
         rows *= keywords["particle_count"]
     world.close()

@@ -69,6 +69,9 @@ GARDEN_METHODS: dict[str, str] = {
 }
 """Methods for gardens, where a rule updates the particles and actions are of brushes."""
 
+UNLEARNED = {"codes": "codes", "central": "numbers for all particles"}
+"""What actions are that no method learns, by `Problem.controlled`; other libraries learn them."""
+
 
 class Trained(NamedTuple):
     """What `train` returns: rules or a policy, and the learning curve."""
@@ -184,10 +187,11 @@ def _checked_function(
             raise NPAError(
                 f"{name.lower()} must be a {name}, got {shown(value)}: make it with {make}"
             )
-    if problem.controlled == "codes" and method in GARDEN_METHODS | METHODS:
+    if problem.controlled in UNLEARNED and method in GARDEN_METHODS | METHODS:
         raise NPAError(
-            f"method {shown(method)} cannot learn codes, the actions of {problem.env_id}: "
-            "give a function of your own, 'package.module:function', or take another library"
+            f"method {shown(method)} cannot learn {UNLEARNED[problem.controlled]}, the actions of "
+            f"{problem.env_id}: give a function of your own, 'package.module:function', or take "
+            "another library"
         )
     function = _function(method, methods_for(problem))
     known = _options_of(function)
@@ -197,8 +201,8 @@ def _checked_function(
 
 
 def methods_for(problem: Problem) -> dict[str, str]:
-    """Return `METHODS`, or `GARDEN_METHODS` in a garden, or none where actions are codes."""
-    if problem.controlled == "codes":
+    """Return `METHODS`, or `GARDEN_METHODS` in a garden, or none for `UNLEARNED` actions."""
+    if problem.controlled in UNLEARNED:
         return {}
     return GARDEN_METHODS if problem.controlled == "brushes" else METHODS
 

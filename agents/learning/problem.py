@@ -119,7 +119,9 @@ class Problem:
 
     @property
     def controlled(self) -> Controls:
-        """What actions control: "particles", those of "species", "brushes", or a rule's "codes"."""
+        """What actions are of: "particles", "species", "brushes", "codes", or "central" control."""
+        if getattr(self.config, "control", "particles") == "central":
+            return "central"
         return self.task_type.controls
 
     @cached_property

@@ -39,7 +39,15 @@ from npa_envs.envs.core.single import NPAEnv
 from npa_envs.envs.core.vector import NPAVectorEnv
 from npa_envs.envs.garden.base import GardenEnv
 from npa_envs.envs.trained_rules import RuleDrivenWorlds
-from npa_envs.registration import CODED, ENVIRONMENTS, GARDENS, SIZES, SMALL, Registration
+from npa_envs.registration import (
+    CENTRAL,
+    CODED,
+    ENVIRONMENTS,
+    GARDENS,
+    SIZES,
+    SMALL,
+    Registration,
+)
 
 DOCS = Path(__file__).resolve().parents[1]
 PAGES = DOCS / "environments"
@@ -60,6 +68,7 @@ ONCE = {
     "Reward": "The values of `reward` mean the same in [every environment]({page}#reward).",
     "Starting state": "Seeds are those of [every environment]({page}#starting-state).",
     "Episode end": "Causes and reasons are those of [every environment]({page}#episode-end).",
+    "Central control": "It is as in [every environment]({page}#central-control).",
     "Rendering": "Modes and styles are those of [every environment]({page}#rendering).",
     "Vectorized environment": "Batches of worlds and the arguments of `gym.make_vec` are those of "
     "[every environment]({page}#vectorized-environment).",
@@ -83,6 +92,8 @@ def resolved_sections(env_class: type) -> dict[str, str]:
     own = sections(env_class)
     first = sections(environment_class(FIRST))
     shared = sections(NPAEnv)
+    if "control" in env_class.task_type.config_type.fixed:
+        del shared["Central control"]
     order = [name for name in (first | shared) if name]
     if env_class.task_type.worlds_type is RuleDrivenWorlds:
         # They pay and tell otherwise; all else that they do not say is said of all environments.
@@ -141,7 +152,7 @@ def argument_tables(config_type: type[EnvConfig]) -> str:
 def small_forms(registration: Registration) -> str:
     """Return what ids with other keywords there are of an environment, Markdown."""
     told = ""
-    for small in (*SMALL, *SIZES):
+    for small in (*SMALL, *SIZES, *CENTRAL):
         if small.name == registration.name:
             given = ", ".join(
                 f"`{name}={default_text(value).strip('`')}`"

@@ -20,7 +20,7 @@ from npa_envs.checks import number_tensor
 from npa_envs.envs.core.config import EnvConfig
 from npa_envs.envs.core.step_report import StepNumbers, named_terms
 from npa_envs.envs.core.task import EnvTask
-from npa_envs.envs.core.worlds import ParticleWorlds
+from npa_envs.envs.core.worlds import CentralWorlds, ParticleWorlds
 from npa_envs.errors import NPAError
 from npa_envs.render import Window, show
 from npa_envs.render.display import side_by_side
@@ -59,6 +59,22 @@ class ParticleSpaces:
         """
         batched = self.observation_output(observation)
         return batched if self._output == "torch" else per_world(batched, ended)
+
+
+class CentralSpaces(ParticleSpaces):
+    """Spaces of a controller that observes a coarse picture and acts at the places of a grid."""
+
+    def __init__(self, physics: Physics, config: EnvConfig) -> None:
+        super().__init__(physics, config)
+        limit, size = physics.limits.perception, 4 * config.picture_size**2
+        self.observation_space = Box(-limit, limit, (size,), np.float32)
+        self._shape = (config.place_count**2, physics.action_dim)
+        self._flat = (self._shape[0] * self._shape[1],)
+        self.action_space = Box(-1.0, 1.0, self._flat, np.float32)
+
+    def action(self, action: Any, world_count: int | None) -> Tensor:
+        """Return checked actions, float32, [B, P², A]: a row for each place, bottom row first."""
+        return batch_tensor(action, world_count, self._flat, "P² A").view(-1, *self._shape)
 
 
 def to_output(tensor: Tensor, output: str) -> Any:
@@ -220,10 +236,13 @@ class WorldsEnv(ShownEnv):
         """Set `config`, `worlds`, `task` and `spaces`; `steps`: maximum of an episode."""
         self.config = self.task_type.config_type.from_keywords(keywords)
         self.render_mode = self.config.render_mode
+        is_central = self.config.control == "central"
         worlds_type = self.task_type.worlds_type or ParticleWorlds
+        worlds_type = CentralWorlds if is_central else worlds_type
         self.worlds = worlds_type(self.task_type, self.config, world_count, steps)
         self.task = self.worlds.task
         spaces_type = self.task_type.spaces_type or ParticleSpaces
+        spaces_type = CentralSpaces if is_central else spaces_type
         self.spaces: ParticleSpaces = spaces_type(self.worlds.physics, self.config)
 
     def _change_worlds(

@@ -28,6 +28,7 @@ from npa_envs.world.environment_steps import Boundary, Limits, Physics, Terms
 
 Output = Literal["numpy", "torch"]
 OnDivergence = Literal["terminate", "reset", "raise", "ignore"]
+Control = Literal["particles", "central"]
 
 MAX_VALUE = 1e9
 """Maximum of a field; so products of fields are finite in float32."""
@@ -281,6 +282,7 @@ class EnvConfig(WorldConfig):
     """Configuration fields of all environments of one species; each task adds its own."""
 
     choices = WorldConfig.choices | {
+        "control": get_args(Control),
         "reward": tuple(REWARDS),
         "on_divergence": get_args(OnDivergence),
         "render_style": STYLES,
@@ -310,6 +312,20 @@ class EnvConfig(WorldConfig):
     """Steps after which the environment itself truncates an episode; None: never. Needed where
     reward is "sparse", except by `make_vec`, which has `max_episode_steps`."""
 
+    control: Control = "particles"
+    """Who acts: "particles", by a row each; or "central", one controller of few numbers, see the
+    section Central control."""
+
+    place_count: int = 4
+    """Places P on each side of the grid, where control is "central"; 1: one action for all
+    particles."""
+
+    place_reach: float = 1.0
+    """Half of the side of the square that grid and observed picture span [length units]."""
+
+    picture_size: int = 8
+    """Pixels G on each side of the observed picture, where control is "central"."""
+
     success_loss: float | None = None
     """The episode ends in success once the loss is at most this; None: as the task decides."""
 
@@ -323,6 +339,9 @@ class EnvConfig(WorldConfig):
             check_positive(self, int, "episode_steps")
         check_flag(self, "tell_updated")
         check_positive(self, int, "seed_pool", at_least=0)
+        check_positive(self, int, "place_count")
+        check_positive(self, float, "place_reach")
+        check_positive(self, int, "picture_size", at_least=2)
         if self.success_loss is not None:
             check_non_negative(self, "success_loss")
         if self.task_config_type is not None:

@@ -71,6 +71,20 @@ class NPAEnv(WorldsEnv, gymnasium.Env[Any, Any]):
     | `particle_reward` | step, with two `reward`s | each particle's reward, shape [N] |
     | `updated` | step, with `tell_updated=True` | which particles it updated, bool, shape [N] |
 
+    ## Central control
+
+    With `control="central"` one controller of few numbers acts, for learners whose policy is one
+    Gaussian over the whole action.
+
+    It observes `Box(-64, 64, (4 G²,), float32)` with G = `picture_size`: red, green, blue and
+    density of G × G pixels, row by row from the bottom up. They span ±`place_reach` along x and y.
+    Each particle is shared bilinearly between the four pixels around it, at the edge if it is
+    outside; colours are sums over particles. Particles that cover the square evenly have density 1.
+
+    It acts by `Box(-1, 1, (P² A,), float32)` with P = `place_count`: a particle's row of A numbers
+    at each place of a grid over the same square, row by row. A particle gets the row interpolated
+    bilinearly between the four places around it. With P = 1 all particles get one row.
+
     ## Rendering
 
     `render_mode="rgb_array"` makes uint8 pictures of shape [R, R, 3], R = `render_size`, that show

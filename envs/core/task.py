@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 AnyConfig = TypeVar("AnyConfig", bound=WorldConfig)
 Config = TypeVar("Config", bound=EnvConfig)
 
-Controls = Literal["particles", "species", "brushes", "codes"]
+Controls = Literal["particles", "species", "brushes", "codes", "central"]
 """What the actions of an environment control."""
 
 PICTURE_SIGMA = 0.7
@@ -126,6 +126,9 @@ class EnvTask(WorldTask[Config]):
 
     spaces_type: ClassVar[type[ParticleSpaces] | None] = None
     """Class of the spaces; None: `ParticleSpaces`, a row for each particle."""
+
+    place_middle: ClassVar[float] = 0.0
+    """Both coordinates of the middle of the square of central control [length units]."""
 
     grows: bool = False
     """Whether a rule grows each new world, in many steps."""

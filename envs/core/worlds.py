@@ -9,9 +9,11 @@ from typing import Any
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 from numpy.typing import NDArray
 from torch import Tensor
 
+from npa_envs import world_mean
 from npa_envs.envs.core.config import EnvConfig
 from npa_envs.envs.core.graphed_steps import GraphedStarts, GraphedSteps
 from npa_envs.envs.core.step_report import REWARDS, ParticleRewards, WorldEpisodes
@@ -26,6 +28,7 @@ from npa_envs.envs.core.task import (
 )
 from npa_envs.envs.core.world_state import WorldState, check_default_dtype, not_finite
 from npa_envs.errors import NPAError, shown
+from npa_envs.rule.rule import COLOUR_OFFSET
 from npa_envs.world.cuda_graph import SideStream, makes_plain_tensors, to_device_async
 from npa_envs.world.environment_steps import (
     DIVERGED,
@@ -353,3 +356,47 @@ class ParticleWorlds(BatchedWorlds):
         if self.task.config.tell_updated:
             info["updated"] = self._actions.updated()
         return info
+
+
+class CentralWorlds(ParticleWorlds):
+    """Worlds in which one controller acts at the places of a grid, and observes a coarse picture.
+
+    A particle's row of the action is interpolated bilinearly between the places around it; outside
+    of the grid it is that of the nearest point of its edge.
+    """
+
+    @torch.no_grad()
+    @makes_plain_tensors
+    def queue(self, action: Tensor, out: Tensor | None = None) -> Tensor:
+        """Step worlds by finite actions, [B, P², A]; return pictures, in `out` if it is given."""
+        if not bool(torch.isfinite(action).all()):
+            raise not_finite(action)
+        size = self.task.config.place_count
+        rows = action.to(self.device).reshape(self.world_count, size, size, -1)
+        grid, where = rows.permute(0, 3, 1, 2), self._in_square()[:, :, None]
+        sampled = F.grid_sample(grid, where, padding_mode="border", align_corners=True)
+        self.steps.act(sampled[..., 0].transpose(1, 2).contiguous())
+        return self.perceive(out)
+
+    @torch.no_grad()
+    @makes_plain_tensors
+    def perceive(self, out: Tensor | None = None) -> Tensor:
+        """Return all worlds' pictures, shape [B, 4 G²], in `out` if it is given."""
+        size, limit = self.task.config.picture_size, self.physics.limits.perception
+        pixels = torch.linspace(-1.0, 1.0, size, device=self.device)
+        apart = (self._in_square()[..., None] - pixels).abs()
+        across, up = (1.0 - apart * (0.5 * (size - 1))).clamp_min(0.0).unbind(dim=2)
+        weights = up[..., None] * across[..., None, :]
+        colours = self.s[..., -3:] + COLOUR_OFFSET
+        values = torch.cat((colours, torch.ones_like(colours[..., :1])), dim=-1)
+        values = weights[..., None] * values[:, :, None, None]
+        observed = (size**2 * world_mean(values.flatten(2))).clamp(-limit, limit)
+        return observed if out is None else out.copy_(observed)
+
+    def _in_square(self) -> Tensor:
+        """Return positions, [B, N, 2], where the square of pictures and places is [-1, 1]²."""
+        scaled: Tensor = (self.x - self.task.place_middle) / self.task.config.place_reach
+        return scaled.clamp(-1.0, 1.0)
+
+    restart = BatchedWorlds.restart
+    host_observation = BatchedWorlds.host_observation

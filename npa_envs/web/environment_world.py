@@ -11,7 +11,7 @@ from torch import Tensor
 from npa_envs.agents.policies import RandomPolicy, RulePolicy, ZeroPolicy
 from npa_envs.checks import is_whole
 from npa_envs.errors import NPAError, shown, suggest
-from npa_envs.registration import ALL, CODED, GARDEN_IDS
+from npa_envs.registration import ALL, WORLD_IDS
 from npa_envs.rule.files import load_rule
 from npa_envs.rule.rule import COLOUR_OFFSET
 from npa_envs.tasks.base import Task
@@ -31,8 +31,7 @@ def make_environment(
     "random", or a rule as for `load_rule`. `keywords` are those of `gymnasium.make`; None counts as
     not given.
     """
-    others = {*GARDEN_IDS, *(environment.id for environment in CODED)}
-    if id in others:
+    if id in WORLD_IDS:
         raise NPAError(
             f"environments whose actions are updates of particles can be viewed, got {shown(id)}: "
             "view the rule that runs its particles instead"
@@ -50,7 +49,7 @@ def make_environment(
     try:
         env = gymnasium.make(id, **options, **keywords)
     except (gymnasium.error.Error, ModuleNotFoundError) as error:
-        known = [environment.id for environment in ALL if environment.id not in others]
+        known = [environment.id for environment in ALL if environment.id not in WORLD_IDS]
         raise NPAError(f"unknown environment {shown(id)}: {suggest(id, known)}") from error
     except TypeError as error:
         if isinstance(error, NPAError):

@@ -18,7 +18,7 @@ from support.refusals import refused
 from support.small_envs import IDS, SPECIAL, assert_batch_of_singles, assert_same, begun
 
 from npa_envs.envs import multispecies_v0
-from npa_envs.registration import ALL, GARDENS, SIZES
+from npa_envs.registration import ALL, CENTRAL, GARDENS, SIZES
 from npa_envs.registration import SMALL as SMALL_GARDENS
 
 PICTURES, SHAPESHIFTER = "npa/Pictures2D-v0", "npa/Shapeshifter2D-v0"
@@ -34,10 +34,12 @@ for garden in GARDENS:
     CASES |= {f"{garden.id}-{form}": (garden.id, given) for form, given in FORMS.items()}
 for form in ("code", "choice"):
     CASES[f"{SHAPESHIFTER}-{form}"] = (SHAPESHIFTER, {"actions": form})
+for name in ("npa/Morphogenesis2D-v0", "npa/PointClassification-v0"):
+    CASES[f"{name}-central"] = (name, {"control": "central", "place_count": 3, "picture_size": 5})
 
 SIZED = {row.id: (row.id, {"seed_pool": 2, "grow_steps": 4}) for row in SMALL_GARDENS} | {
     row.id: (row.id, {} if "Small" in row.id else small_envs.small(row.id.replace("Large", "")))
-    for row in SIZES
+    for row in (*SIZES, *CENTRAL)
 }
 """Small forms as they are registered; large ones with few particles."""
 
@@ -328,7 +330,7 @@ class TestEveryEnvironment:
 
 @pytest.mark.parametrize("row", ALL, ids=lambda row: row.id)
 def test_gymnasiums_wrappers_make_pictures_the_observations_of_every_id(row):
-    usual = re.sub("(Small|Large)-", "-", row.id)
+    usual = f"npa/{row.name}-v0"
     fields = small_envs.small(usual, render_mode="rgb_array", render_size=48)
     env = AddRenderObservation(gymnasium.make(row.id, **fields))
     shape = (48, 48)

@@ -12,7 +12,7 @@ from npa_envs.agents.learning import Problem
 from npa_envs.envs import multispecies_v0
 from npa_envs.envs.regeneration2d import Regeneration2DEnvConfig
 from npa_envs.envs.trained_rules import GrownConfig, growing_rule
-from npa_envs.registration import ALL, SIZES, SMALL, SPECIES_SIZES
+from npa_envs.registration import ALL, CENTRAL, SIZES, SMALL, SPECIES_SIZES
 from npa_envs.rule.files import rule_file, shipped_rules
 
 FROZEN = json.loads(Path(__file__).with_name("frozen.json").read_text(encoding="utf-8"))
@@ -27,7 +27,7 @@ def check_frozen(part, found):
 
 
 def test_settings_are_what_they_were():
-    now = {row.id: {"steps": row.max_episode_steps, **row.keywords} for row in SIZES}
+    now = {row.id: {"steps": row.max_episode_steps, **row.keywords} for row in (*SIZES, *CENTRAL)}
     now |= {row.id: {"task": row.task, **row.keywords} for row in SPECIES_SIZES}
     hashes = {
         name: hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()
@@ -60,9 +60,9 @@ def test_a_rule_that_is_trained_anew_changes_no_environment():
     check_frozen("rules", found)
 
 
-@pytest.mark.parametrize("row", [*SMALL, *SIZES], ids=lambda row: row.id)
+@pytest.mark.parametrize("row", [*SMALL, *SIZES, *CENTRAL], ids=lambda row: row.id)
 def test_an_id_is_the_environment_of_its_name_with_other_keywords(row):
-    usual = row.id.replace("Small", "").replace("Large", "")
+    usual = f"npa/{row.name}-v0"
     spec, of_usual = gymnasium.spec(row.id), gymnasium.spec(usual)
     assert spec.entry_point == row.entry_point == of_usual.entry_point
     assert spec.vector_entry_point == row.vector_entry_point == of_usual.vector_entry_point
