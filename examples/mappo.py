@@ -21,7 +21,7 @@ from npa_envs.envs import gardeners_v0, particles_v0
 parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
 parser.add_argument("env", choices=["particles", "gardeners"])
 parser.add_argument("--steps", type=int, default=15_000)
-parser.add_argument("--curve", type=Path, default=Path("mappo.json"), help="to write")
+parser.add_argument("--curve", type=Path, help="to write; default: mappo_ENV.json")
 given = parser.parse_args()
 
 ROLLOUT, EPOCHS, PARTS, GAMMA, LAMBDA, CLIP, RATE = 256, 4, 8, 0.9, 0.95, 0.2, 1e-3
@@ -145,5 +145,6 @@ results = {
     "zero": evaluation(lambda seen: torch.zeros(len(seen), acted)),
     "random": evaluation(lambda seen: drawn()[: len(seen)]),
 }
-given.curve.write_text(json.dumps({"env": given.env, "curve": curve, **results}), encoding="utf-8")
+path = given.curve or Path(f"mappo_{given.env}.json")
+path.write_text(json.dumps({"env": f"{given.env}_v0", "curve": curve, **results}), encoding="utf-8")
 print("returns, " + ", ".join(f"{k}: {mean:.2f} ± {e:.2f}" for k, (mean, e) in results.items()))

@@ -25,8 +25,8 @@ parser.add_argument("--curve", type=Path, default=Path("ppo_one_file.json"), hel
 given = parser.parse_args()
 
 NAME = "npa/Gardener2DSmall-v0"
-WORLDS, ROLLOUT, EPOCHS, MINIBATCH = 8, 128, 10, 128
-GAMMA, LAMBDA, CLIP, RATE = 0.9, 0.95, 0.2, 5e-4
+WORLDS, ROLLOUT, EPOCHS, MINIBATCH = 8, 128, 10, 64
+GAMMA, LAMBDA, CLIP, RATE = 0.9, 0.95, 0.2, 1e-3
 EVERY = 5  # rounds between evaluations
 
 torch.set_num_threads(1)  # small worlds; a busy machine does not slow them down

@@ -29,15 +29,21 @@ given = parser.parse_args()
 torch.set_num_threads(1)  # small worlds; a busy machine does not slow them down
 torch.manual_seed(0)
 name = "npa/Morphogenesis2D-v0"
-task = dict(target="heart", particle_count=128, eps=0.15, seed_radius=0.4, colour_weight=20.0)
-task |= dict(state_dim=4, state_scale=0.1, max_episode_steps=32, output="torch")
+task = {
+    "target": "heart",
+    "particle_count": 128,
+    "eps": 0.15,
+    "seed_radius": 0.4,
+    "colour_weight": 20.0,
+}
+task |= {"state_dim": 4, "state_scale": 0.1, "max_episode_steps": 32, "output": "torch"}
 envs = gym.make_vec(name, num_envs=16, autoreset_mode="disabled", **task)
 test_envs = gym.make_vec(name, num_envs=16, **task)
 env = NPATorchRLEnv(envs, rows=True)  # batch size [16, 128]: worlds, particles
 env.set_seed(0)
 
 perceived, acted = (space.shape[-1] for space in (envs.observation_space, envs.action_space))
-sizes = dict(num_cells=[64, 64], activation_class=torch.nn.Tanh)
+sizes = {"num_cells": [64, 64], "activation_class": torch.nn.Tanh}
 scale = AddStateIndependentNormalScale(acted, scale_mapping="exp", init_value=-1.0)
 network = torch.nn.Sequential(MLP(perceived, acted, **sizes), scale)
 actor = ProbabilisticActor(
@@ -65,7 +71,7 @@ def evaluation(policy):
 curve = [(0, *evaluation(policy))]
 rounds = max(1, given.steps // (16 * 16))  # 16 steps of 16 worlds
 frames = 16 * env.batch_size.numel()  # counted in rows
-options = dict(frames_per_batch=frames, total_frames=rounds * frames)
+options = {"frames_per_batch": frames, "total_frames": rounds * frames}
 collector = Collector(env, actor, auto_register_policy_transforms=False, **options)
 for k, batch in enumerate(collector, start=1):
     with torch.no_grad():
