@@ -49,6 +49,7 @@ def join(paths: list[Path]) -> None:
         "commit": current_commit(),
         "date": date.today().isoformat(),
         "machine": machine(torch.device("cpu")),
+        "threads": 1,
         "torch": torch.__version__,
     }
     write_record(RECORD, {**facts, "runs": [runs[name] for name in EXAMPLES if name in runs]})
@@ -70,14 +71,14 @@ def draw() -> bytes:
         steps, means, errors = zip(*run["curve"], strict=True)
         ends = ([m + sign * e for m, e in zip(means, errors, strict=True)] for sign in (-1, 1))
         low, high = ends
-        draw_band(panel, steps, (low, means, high), "C0", "learned")
+        thousands = [count / 1000 for count in steps]
+        draw_band(panel, thousands, (low, means, high), "C0", "learned")
         for name, colour in COLOURS.items():
             if name in run:
                 panel.axhline(run[name][0], color=colour, ls="--", lw=1.0, label=name)
         panel.set_title(run["command"].removeprefix("python examples/"), fontsize=9)
-        panel.set_xlabel("steps of worlds", fontsize=8)
+        panel.set_xlabel("thousand steps of worlds", fontsize=8)
         panel.tick_params(labelsize=7)
-        panel.ticklabel_format(axis="x", style="sci", scilimits=(3, 3))
     # Some panels have a scripted policy as well.
     most = max(panels.flat, key=lambda panel: len(panel.get_lines()))
     legend_of(figure, most, ncols=4, fontsize=8)

@@ -591,8 +591,9 @@ LIBRARIES = {"sb3": "stable_baselines3", "torchrl": "torchrl", "evolution": "cma
 
 
 @foreign
-@pytest.mark.slow
-@pytest.mark.parametrize("name", EXAMPLES)
+@pytest.mark.parametrize(
+    "name", [n if n == "gradient" else pytest.param(n, marks=pytest.mark.slow) for n in EXAMPLES]
+)
 def test_an_example_runs_and_writes_its_curve(name, folder, monkeypatch, capsys):
     pytest.importorskip(LIBRARIES.get(name.partition("_")[0], "torch"))
     program, *words = EXAMPLES[name].split()
