@@ -19,7 +19,7 @@ import npa_envs  # noqa: F401 (registers the ids)
 from npa_envs.agents import evaluate_policy
 
 parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-parser.add_argument("--steps", type=int, default=200_000, help="of all worlds together")
+parser.add_argument("--steps", type=int, default=80_000, help="of all worlds together")
 parser.add_argument("--curve", type=Path, default=Path("evolution.json"), help="to write")
 given = parser.parse_args()
 
@@ -63,7 +63,7 @@ strategy = cma.CMAEvolutionStrategy(np.zeros((perceived + 1) * acted), 0.1, opti
 curve = []
 generations = max(1, given.steps // (CANDIDATES * LENGTH))
 for k in range(generations):
-    if k % 20 == 0:
+    if k % 8 == 0:
         curve.append((k * CANDIDATES * LENGTH, *evaluation(policy)))
         print(f"{curve[-1][0]} steps: {curve[-1][1]:.2f}", flush=True)
     candidates = strategy.ask()

@@ -20,7 +20,7 @@ from npa_envs.envs import gardeners_v0, particles_v0
 
 parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
 parser.add_argument("env", choices=["particles", "gardeners"])
-parser.add_argument("--steps", type=int, default=15_000)
+parser.add_argument("--steps", type=int, default=8_192)
 parser.add_argument("--curve", type=Path, help="to write; default: mappo_ENV.json")
 given = parser.parse_args()
 
@@ -97,7 +97,7 @@ learned = next(iter(groups.values())).mean
 curve = []
 rounds = max(1, given.steps // ROLLOUT)
 for k in range(rounds):
-    if k % 8 == 0:
+    if k % 4 == 0:
         curve.append((k * ROLLOUT, *evaluation(learned)))
         print(f"{curve[-1][0]} steps: {curve[-1][1]:.2f}", flush=True)
 
