@@ -1,6 +1,6 @@
 """Kill one process of a distributed run at random times, and check what is left.
 
-    python benchmarks/kills.py --out benchmarks/results/kills_cpu.jsonl
+    python benchmarks/kills.py --out runs/kills.jsonl
     python benchmarks/kills.py --device cuda --preset paper --interval 50 --kills 1
 
 A line is a JSON object: the last iteration in the log when the process was killed, that of the

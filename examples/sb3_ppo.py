@@ -1,0 +1,64 @@
+"""Stable-Baselines3's PPO learns to keep a heart whole.
+
+pip install 'npa-envs[sb3]'
+python examples/sb3_ppo.py
+"""
+
+import argparse
+import json
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+import torch
+from stable_baselines3 import PPO
+
+import npa_envs  # noqa: F401 (registers the ids)
+from npa_envs.agents import evaluate_policy
+from npa_envs.agents.garden_policies import ScriptedGardener
+from npa_envs.render import write_webp
+
+parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+parser.add_argument("--steps", type=int, default=30_000)
+parser.add_argument("--curve", type=Path, default=Path("sb3_ppo.json"), help="to write")
+given = parser.parse_args()
+
+torch.set_num_threads(1)  # small worlds; a busy machine does not slow them down
+name = "npa/Gardener2DSmall-v0"
+env = gym.make(name, render_mode="rgb_array")
+test_envs = gym.make_vec(name, num_envs=16)
+test_envs.action_space.seed(0)
+piece = min(2048, given.steps)  # steps before PPO learns from them
+model = PPO("MlpPolicy", env, gamma=0.9, n_steps=piece, seed=0, device="cpu")
+
+
+def policy(observations):
+    return model.predict(observations, deterministic=True)[0]
+
+
+def evaluation(policy):
+    episodes = evaluate_policy(test_envs, policy, seeds=range(100, 116))
+    return episodes.mean_return, episodes.standard_error
+
+
+curve = [(0, *evaluation(policy))]
+while model.num_timesteps < given.steps:
+    model.learn(2 * piece, reset_num_timesteps=False)
+    curve.append((model.num_timesteps, *evaluation(policy)))
+    print(f"{curve[-1][0]} steps: {curve[-1][1]:.2f}", flush=True)
+
+results = {
+    "learned": curve[-1][1:],
+    "zero": evaluation(lambda seen: np.zeros((len(seen), *env.action_space.shape), np.float32)),
+    "random": evaluation(lambda _: test_envs.action_space.sample()),
+    "scripted": evaluation(ScriptedGardener(test_envs)),
+}
+given.curve.write_text(json.dumps({"env": name, "curve": curve, **results}), encoding="utf-8")
+print("returns, " + ", ".join(f"{k}: {mean:.2f} ± {e:.2f}" for k, (mean, e) in results.items()))
+
+observation, _ = env.reset(seed=100)
+frames = [env.render()]
+for _ in range(32):
+    observation, *_ = env.step(policy(observation))
+    frames.append(env.render())
+write_webp(given.curve.with_suffix(".webp"), frames, fps=8)
