@@ -16,7 +16,7 @@ from npa_envs.web.messages import BRUSHES
 
 SENT_BRUSHES = [{"name": name} | brush._asdict() for name, brush in BRUSHES.items()]
 SETUP = """
-const rules = { rule: "a", others: ["a", "b"] };
+const rules = { species: ["a"], others: ["a", "b"] };
 const world = { type: "world", title: "t", dimension: 2, tools, capabilities: ["film"], ...rules };
 const frame = (step, places = [0, 0, 1, 1]) => ({
   type: "frame", step, positions: new Float32Array(places), colours: new Uint8Array(6),

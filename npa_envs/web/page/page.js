@@ -124,7 +124,8 @@ class Page {
       // Also for undrawn frames of the former world: the engine waits for each.
       this.reportDrawn();
       const first = world.dimension === 2 ? world.tools[0]?.name : "look", { name: chosen } = this.brushes.chosen;
-      const keeps = before.dimension === world.dimension && world.tools.some(({ name }) => name === chosen);
+      const usable = world.tools.some((brush) => brush.name === chosen && !this.brushes.lack(brush));
+      const keeps = before.dimension === world.dimension && usable;
       this.brushes.choose(keeps ? chosen : first);
     }
     if (before.rule !== world.rule || before.seed !== world.seed) {
@@ -250,7 +251,7 @@ class Brushes {
 
   // Why a brush that the world offers can do nothing in it, or "".
   lack({ name }) {
-    const { others, rule } = this.page.world, fits = others.some((other) => other !== rule);
+    const { others, species } = this.page.world, fits = new Set([...others, ...species]).size > 1;
     return name !== "graft" || fits ? "" : "Graft: no other rule fits; it needs the same ε0, channels and dimension";
   }
 
