@@ -76,6 +76,7 @@ check: $(DEV)
 # Sphinx imports the library from there too, also where another one is installed.
 docs: $(DOCS)
 	$(BIN)/python -m sphinx -W --keep-going --quiet -b html -c docs -d build/docs-cache . build/docs
+	@echo "the site: build/docs/index.html"
 
 bench-check: $(CORE)
 	OMP_NUM_THREADS=1 $(BIN)/python benchmarks/alternatives.py --quick --device cpu --check benchmarks/results/ratios.json

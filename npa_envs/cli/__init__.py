@@ -7,6 +7,7 @@ import errno
 import importlib
 import io
 import os
+import re
 import sys
 from collections.abc import Iterator, Sequence
 
@@ -78,7 +79,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         with _printed_targets():
             return _dispatch(words)
     except NPAError as error:
-        print(f"npa-envs: error: {' '.join(str(error).split())}", file=sys.stderr)
+        message = re.sub(r"make the environment with (?=\w+=)", "say --keywords ", str(error))
+        print(f"npa-envs: error: {' '.join(message.split())}", file=sys.stderr)
         return ERROR
     except KeyboardInterrupt:
         print("npa-envs: interrupted", file=sys.stderr)

@@ -9,7 +9,6 @@ import io
 import json
 import math
 import re
-import sys
 import tempfile
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
@@ -40,9 +39,8 @@ def parse_options(
 ) -> OptionsT:
     """Parse a command's arguments to the dataclass `cls`; options not given are as in `default`.
 
-    Ends the process after `--help`, and with code 2 for a wrong argument; raises NPAError for an
-    unknown option and where the dataclass does. The help begins with `description`, by default the
-    dataclass's docstring.
+    Ends the process after `--help`; raises NPAError for a wrong argument and where the dataclass
+    does. The help begins with `description`, by default the dataclass's docstring.
     """
     kwargs: dict[str, Any] = {} if default is None else {"default": default}
     kwargs["config"] = tyro.conf.OmitArgPrefixes, tyro.conf.DisallowNone, tyro.conf.SuppressFixed
@@ -82,9 +80,26 @@ def parse_options(
                 nearest = suggest(by_word.get(name, name), known).partition("known: ")[0]
                 hint = nearest.replace("'", "'--", 1)
                 raise NPAError(f"unknown option {word!r}: {hint or 'see --help'}") from end
-        print(said.getvalue(), end="", file=sys.stderr)
-        raise
+        raise NPAError(f"{_first_message(said.getvalue())}: see npa-envs {command} --help") from end
     return options
+
+
+def _first_message(said: str) -> str:
+    """Return the first message in the frame that tyro prints for wrong arguments, as one line."""
+    # After the title; lines of dashes separate the parts.
+    parts = re.split("[─-]{9,}", said.partition("\n")[2])
+    message = next(filter(None, (" ".join(re.sub("[│╰╯]", " ", part).split()) for part in parts)))
+    for pattern, plain in (
+        (r"Error parsing (\S+): .*invalid literal.*: (.*)", r"\1 must be a whole number, got \2"),
+        (r"Error parsing (\S+): .*could not convert.*: (.*)", r"\1 must be a number, got \2"),
+        (r"Error parsing (\S+): .*arguments:? \[(.*?)\].*", r"\1 cannot be \2"),
+        (r"Missing value for argument '(\S+)'.*", r"\1 needs a value"),
+        (r"invalid choice (.*) for argument '(\S+)'\. Expected one of \((.*?),?\)\.",
+         r"\2 must be one of \3, got \1"),
+        (r"Missing from .*?: (\S+) .*", r"\1 is missing"),
+    ):  # fmt: skip
+        message = re.sub(pattern, plain, message)
+    return message
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -117,7 +117,7 @@ def ids() -> Iterator[str]:
 def rules() -> Iterator[str]:
     """Yield a line for each shipped rule: its size, and its scores after some steps."""
     from npa_envs.measure.quality import scores
-    from npa_envs.rule.files import load_rule, shipped_rules
+    from npa_envs.rule.files import load_rule, preset_rules, shipped_rules
 
     yield "RULES that are shipped: npa-envs view NAME, npa-envs rollout NAME"
     yield "  their weights, and a score of worlds that training never saw, at steps of their lives"
@@ -127,6 +127,7 @@ def rules() -> Iterator[str]:
             values = {row["step"]: format(row[column], form) for row in scores(name)[table]}
             text = ", ".join(f"{values[step]} at {step}" for step in STEPS if step in values)
             yield f"    {name:<10} {load_rule(name).weight_count:>6} weights  {text}"
+    yield f"  presets and environments start from: {', '.join(preset_rules())}"
 
 
 PARTS = {"rules": rules, "targets": targets, "ids": ids, "presets": presets}

@@ -247,9 +247,8 @@ def _locate(source: str | Path) -> tuple[Path, str | None]:
             "for example 'gecko'"
         )
     text = str(source)
-    known = shipped_rules()
     suffixes = ", ".join(_SUFFIXES)
-    named = known | preset_rules()
+    named = shipped_rules() | preset_rules()
     if text in named:
         return named[text], None
     if os.path.isdir(text):
@@ -276,7 +275,7 @@ def _locate(source: str | Path) -> tuple[Path, str | None]:
     if os.path.isfile(os.path.join(run, "rule.safetensors")):
         raise NPAError(f"unknown rule {shown(text)}: did you mean the run {shown(run)}?")
     raise NPAError(
-        f"unknown rule {shown(text)}: {suggest(text, known)}; or give the path of a "
+        f"unknown rule {shown(text)}: {suggest(text, named)}; or give the path of a "
         f"file that ends in {suffixes}, or a run's folder"
     )
 

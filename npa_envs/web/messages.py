@@ -141,7 +141,7 @@ class Brush(NamedTuple):
 
 
 BRUSHES = {
-    "wipe": Brush("states", "Wipe: sets states to zero; the world heals it", "frame"),
+    "wipe": Brush("states", "Wipe: sets states to zero; many rules heal it", "frame"),
     "cut": Brush("positions", "Cut: opens a slit along the line that you draw", "line"),
     "push": Brush(
         "positions",
@@ -159,9 +159,7 @@ BRUSHES = {
         amounts=(0.0, 0.5),
     ),
     "graft": Brush("species", "Graft: gives particles another rule", "position", takes="rule"),
-    "add": Brush(
-        "growth", "Add: puts in a seed of another rule", "once", takes="rule", amounts=(0.0, 0.5)
-    ),
+    "add": Brush("growth", "Add: puts in a seed", "once", takes="rule", amounts=(0.0, 0.5)),
     "remove": Brush("removal", "Remove: takes particles away, for good", "frame"),
 }
 """All brushes, in the order of their buttons and keys; a page begins with the first of its world.

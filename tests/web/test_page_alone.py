@@ -16,7 +16,8 @@ from npa_envs.web.messages import BRUSHES
 
 SENT_BRUSHES = [{"name": name} | brush._asdict() for name, brush in BRUSHES.items()]
 SETUP = """
-const world = { type: "world", title: "t", dimension: 2, tools, capabilities: ["film"] };
+const rules = { species: ["a"], others: ["a", "b"] };
+const world = { type: "world", title: "t", dimension: 2, tools, capabilities: ["film"], ...rules };
 const frame = (step, places = [0, 0, 1, 1]) => ({
   type: "frame", step, positions: new Float32Array(places), colours: new Uint8Array(6),
   milliseconds: 1,
@@ -121,8 +122,20 @@ def test_a_page_begins_with_a_brush_that_heals_and_says_what_it_does(run):
         return [first, keys.length, last, page.brushes.chosen.name];
     """)
     removing = "Remove: takes particles away, for good"
-    wiping = "Wipe: sets states to zero; the world heals it"
+    wiping = "Wipe: sets states to zero; many rules heal it"
     assert shown == [["wipe", wiping], 10, ["remove", removing], "look"]
+
+
+def test_graft_is_refused_with_its_reason_where_no_other_rule_fits(run):
+    hints = run("""
+        return [["a"], ["a", "b"]].map((others) => {
+          listen({ ...world, others });
+          element("brushes").children.find((one) => one.dataset.brush === "graft").onclick();
+          return [page.brushes.chosen.name, element("hint").textContent];
+        });
+    """)
+    assert [name for name, _ in hints] == ["wipe", "graft"]
+    assert "no other rule fits" in hints[0][1]
 
 
 def test_all_that_a_page_shows_has_a_meaning(run):

@@ -14,6 +14,9 @@ const BLANK = {
 // The page's own brush, before those of the world: it sends no messages.
 const LOOK = { name: "look", label: "Look: drag to move or turn, wheel or pinch to zoom" };
 
+// Words for the names of `shows_of` of live_world.py that need plainer ones.
+const WORDS = { components: "states as colours", mask: "updated now" };
+
 // What colours mean, by the names of `shows_of` of live_world.py, those of state channels without their number.
 const MEANINGS = {
   colours: "The particles' own colours, which make the picture.",
@@ -121,7 +124,8 @@ class Page {
       // Also for undrawn frames of the former world: the engine waits for each.
       this.reportDrawn();
       const first = world.dimension === 2 ? world.tools[0]?.name : "look", { name: chosen } = this.brushes.chosen;
-      const keeps = before.dimension === world.dimension && world.tools.some(({ name }) => name === chosen);
+      const usable = world.tools.some((brush) => brush.name === chosen && !this.brushes.lack(brush));
+      const keeps = before.dimension === world.dimension && usable;
       this.brushes.choose(keeps ? chosen : first);
     }
     if (before.rule !== world.rule || before.seed !== world.seed) {
@@ -245,9 +249,15 @@ class Brushes {
     return [LOOK, ...this.page.world.tools];
   }
 
-  // Takes the brush of a name, or "look" if the world does not offer it.
+  // Why a brush that the world offers can do nothing in it, or "".
+  lack({ name }) {
+    const { others, species } = this.page.world, fits = new Set([...others, ...species]).size > 1;
+    return name !== "graft" || fits ? "" : "Graft: no other rule fits; it needs the same ε0, channels and dimension";
+  }
+
+  // Takes the brush of a name, or "look" if the world does not offer it or it can do nothing.
   choose(name) {
-    this.chosen = this.offered.find((brush) => brush.name === name) ?? LOOK;
+    this.chosen = this.offered.find((brush) => brush.name === name && !this.lack(brush)) ?? LOOK;
     for (const button of $("brushes").children)
       button.setAttribute("aria-checked", String(button.dataset.brush === this.chosen.name));
     if (this.chosen.takes === "rule") $("brush").open = true;
@@ -432,7 +442,7 @@ class Controls {
     const other = world.others.includes($("other").value) && before.rule === world.rule
       ? $("other").value : world.others.find((name) => name !== world.rule);
     options($("other"), world.others, other);
-    options($("show"), world.shows, world.show);
+    options($("show"), world.shows, world.show, WORDS);
     const classes = Array.from({ length: world.class_count }, (_, k) => `${k} ${CLASSES[k % CLASSES.length]}`);
     $("meaning").textContent = world.show === "colours" && classes.length
       ? `Which class each particle takes this for: ${classes.join(", ")}; grey where it is not sure.`
@@ -473,13 +483,16 @@ class Controls {
   }
 
   showBrushes() {
-    const { brushes } = this.page, names = brushes.offered.map(({ label }) => label).join();
+    const { brushes } = this.page, names = brushes.offered.map((brush) => brushes.lack(brush) || brush.label).join();
     if ($("brushes").dataset.names === names) return;
     $("brushes").dataset.names = names;
-    $("brushes").replaceChildren(...brushes.offered.map(({ name, label }, k) => {
+    $("brushes").replaceChildren(...brushes.offered.map((brush, k) => {
+      const { name, label } = brush, lack = brushes.lack(brush);
       const button = make("button", {
-        innerHTML: icon(name, label.split(":")[0]), title: `${label} (${(k + 1) % 10})`, onclick: () => brushes.choose(name),
+        innerHTML: icon(name, label.split(":")[0]), title: `${lack || label} (${(k + 1) % 10})`,
+        onclick: () => { if (lack) $("hint").textContent = lack; else brushes.choose(name); },
       });
+      if (lack) button.setAttribute("aria-disabled", "true");
       button.dataset.brush = name;
       button.setAttribute("role", "radio");
       return button;
@@ -599,10 +612,10 @@ function recorder(canvas, done) {
   return { stop: () => media.stop() };
 }
 
-function options(select, names, chosen) {
+function options(select, names, chosen, words = {}) {
   if (select.dataset.names !== names.join("\n")) {
     select.dataset.names = names.join("\n");
-    select.replaceChildren(...names.map((name) => new Option(name, name)));
+    select.replaceChildren(...names.map((name) => new Option(words[name] ?? name, name)));
   }
   if (chosen) select.value = chosen;
 }

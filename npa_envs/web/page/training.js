@@ -27,7 +27,8 @@ export class TrainingCard {
     if (event.type !== "training") return;
     if (!this.card) this.build();
     // A tab learns of a training once, and may then fold the card.
-    if (ACTIVE.includes(event.state) && event.id !== this.event?.id) this.open = true;
+    if (ACTIVE.includes(event.state) && event.id !== this.event?.id)
+      Object.assign(this, { open: true, choosing: false });
     this.event = event;
     const mine = sessionStorage.getItem(MINE) === event.id;
     if (event.has_rule && mine && this.showing !== event.id) this.show();
@@ -121,10 +122,9 @@ export class TrainingCard {
   }
 
   closed() {
-    const { state, name, iteration = 0, total = Infinity, has_rule: learned } = this.event;
+    const { state, name, iteration = 0, total = Infinity } = this.event, active = ACTIVE.includes(state);
     const share = `Learning ${name}: ${Math.floor((100 * iteration) / total)} %`;
-    const label = ACTIVE.includes(state) ? share : learned ? name : "Grow your own picture";
-    return [button(label, () => this.change({ open: true }))];
+    return [button(active ? share : "Grow your own picture", () => this.change({ open: true, choosing: !active }))];
   }
 
   empty() {
@@ -134,9 +134,10 @@ export class TrainingCard {
     emoji.onkeydown = ({ key }) => { if (key === "Enter") typed(); };
     return [
       this.heading("Grow your own picture"),
-      text("Drop a picture or a 3D file anywhere here. Particles learn it while you watch."),
+      text("Choose or drop a picture or a 3D file. Particles learn it while you watch."),
       row(button("Choose a file", () => this.file.click())),
       row(text("or an emoji"), emoji, button("Grow", typed)),
+      ...(this.event.has_rule ? [row(button(`Show ${this.event.name}`, () => this.change({ choosing: false })))] : []),
     ];
   }
 
@@ -167,7 +168,7 @@ export class TrainingCard {
     });
     const how = state === "done" ? `Learned in ${duration(seconds)}` : `Stopped at iteration ${iteration} of ${total}`;
     return [
-      this.heading(name), text(`${how}. Cut it, wipe a part of it.`), this.quality(),
+      this.heading(name), text(this.showing === id ? `${how}. Cut it, wipe a part of it.` : `${how}.`), this.quality(),
       row(link("Save rule", "rule.safetensors", ".safetensors"), link("Save page", "page.html", ".html"),
         this.showing === id ? button("Back", () => this.leave()) : this.watch(),
         button("Another", () => this.change({ choosing: true }))),
