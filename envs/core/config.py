@@ -342,6 +342,8 @@ class EnvConfig(WorldConfig):
         check_positive(self, int, "place_count")
         check_positive(self, float, "place_reach")
         check_positive(self, int, "picture_size", at_least=2)
+        # The observed picture has colours.
+        check_positive(self, int, "state_dim", at_least=3 if self.control == "central" else 1)
         if self.success_loss is not None:
             check_non_negative(self, "success_loss")
         if self.task_config_type is not None:

@@ -61,6 +61,7 @@ def test_wrong_central_actions_leave_the_world_and_some_worlds_have_no_centre():
     refused(r"\[P² A\] = \(24,\), got \(5, 6\)", env.step, np.zeros((5, 6), np.float32))
     refused("action.*must be finite", env.step, np.full(24, np.nan, np.float32))
     assert all(map(torch.equal, before, env.particles()))
+    refused("state_dim must be .* at least 3", make, state_dim=2)
     for name in ("Morphogenesis3D", "Pictures2D", "Gardener2D", "Shapeshifter2D"):
         rule = "control must be 'particles'"
         refused(rule, gymnasium.make, f"npa/{name}-v0", control="central")
@@ -75,7 +76,7 @@ def test_the_small_forms_are_for_other_libraries_learners(row):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("row", CENTRAL, ids=lambda row: row.id)
-def test_another_librarys_ppo_learns_with_its_own_settings(row):
+def test_ppo_of_another_library_learns_with_its_own_settings(row):
     sb3 = pytest.importorskip("stable_baselines3")
     env = gymnasium.make(row.id)
     model = sb3.PPO("MlpPolicy", env, seed=0, device="cpu").learn(12_288)
