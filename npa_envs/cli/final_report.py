@@ -98,8 +98,8 @@ def write_report(
 ) -> tuple[Path, str]:
     """Measure and film the rule in the file `path`; return the model card's path and its scores.
 
-    The scores are one line of text. `training` tells how the rule was trained: iterations, time and
-    command.
+    The scores are a line of text, then one for each of `shortfalls`. `training` tells how the rule
+    was trained: iterations, time and command.
 
     The folder gets the model card STEM.md, STEM.json as of `npa-envs evaluate --json`, STEM.gif,
     STEM.mp4 and STEM-filmstrip.png, for a 3D rule also a turntable and point files. On a CPU fewer
@@ -143,8 +143,8 @@ def write_report(
         if (folder / f"{path.stem}-{name}.png").exists()
     )
     write_text(model_card, _model_card(rule, task, task_name, training, facts, tables, pictures))
-    said = "".join(f"; {clause}" for clause in shortfalls(tables))
-    return model_card, score_line(json.loads(text)) + said + missing_films
+    said = "".join(f"\n              {clause}" for clause in shortfalls(tables))
+    return model_card, score_line(json.loads(text)) + missing_films + said
 
 
 def _write_films(

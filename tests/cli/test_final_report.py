@@ -117,7 +117,7 @@ def test_a_report_says_where_worlds_do_not_hold(factor, holds, tmp_path, capsys,
 
     monkeypatch.setattr(report, "tables_of", measured)
     assert main(words_of("morphogenesis2d", tmp_path)) == 0
-    said = "; unstable: at step 128 the loss is many times the least"
+    said = " unstable: at step 128 the loss is many times the least"
     assert (said in capsys.readouterr().out) is not holds
 
 
