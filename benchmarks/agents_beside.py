@@ -6,10 +6,11 @@
 An agent-step is one action of one agent; where every particle acts it is a particle-step. All have
 the same number of agents (MAgent2's Battle the nearest that its maps allow) and of worlds, random
 actions made beforehand, observations of every agent in every step, and episodes of `--steps` steps:
-a reading is one episode and the reset after it. A round takes one reading of each. VMAS and the
-environments in batches step all worlds together; the others' worlds are stepped in turn, and are
-measured on a CPU alone. A library that is not installed is left out, and so are more worlds than an
-episode of `--longest` seconds allows.
+a reading is one episode and the reset after it. A round takes one reading of each. On a CPU times
+are those of the process, which the machine's other work hardly changes. VMAS and the environments
+in batches step all worlds together; the others' worlds are stepped in turn, and are measured on a
+CPU alone. A library that is not installed is left out, and so are more worlds than an episode of
+`--longest` seconds allows.
 
 `--output` writes the entry `agents` of a JSON file, and leaves the file's other entries as they
 are. `--draw FILE` draws such a file's entry without measuring.
@@ -219,7 +220,7 @@ def missing_libraries() -> dict[str, str]:
 
 
 class Reading(NamedTuple):
-    """One episode: its time [s], the actions that agents took, and the agents of a world."""
+    """One episode: its time [s], and the actions that agents took."""
 
     seconds: float
     actions: int
@@ -228,12 +229,13 @@ class Reading(NamedTuple):
 def read(runner: Runner, case: Case, steps: int) -> Reading:
     """Step worlds that have been reset, and reset them again."""
     device = torch.device(case.device)
+    clock = time.process_time if device.type == "cpu" else time.perf_counter
     synchronize(device)
-    begun = time.perf_counter()
+    begun = clock()
     actions = sum(runner.step() for _ in range(steps))
     runner.reset()
     synchronize(device)
-    return Reading(time.perf_counter() - begun, actions)
+    return Reading(clock() - begun, actions)
 
 
 class Entry(NamedTuple):
@@ -339,25 +341,24 @@ def main() -> None:
     measured = list(entries(arguments, left_out))
     for what, why in left_out.items():
         print(f"left out: {what}: {why}", flush=True)
-    for _ in range(arguments.repeats):
-        for entry in measured:
-            entry.readings.append(read(entry.runner, entry.case, entry.case.episode_steps))
-    rows = [entry.row() for entry in measured]
-    for row in rows:
-        print(
-            f"{row['name']:24} {row['agents_acting']:5.1f} agents {row['world_count']:5} worlds "
-            f"{row['step_us']:12.1f} µs a step {row['agent_steps_per_s']:12.4g} agent-steps a second"
-        )
-    record = {
+    record: dict[str, Any] = {
         **script_facts(arguments),
         "episode_steps": arguments.steps,
-        "repeats": arguments.repeats,
+        "clock": "process" if kind == "cpu" else "wall",
         "left_out": left_out,
-        "rows": rows,
     }
-    if arguments.output:
-        before = read_json(arguments.output) if arguments.output.exists() else {}
-        write_record(arguments.output, before | {"agents": record})
+    for repeat in range(arguments.repeats):
+        for entry in measured:
+            entry.readings.append(read(entry.runner, entry.case, entry.case.episode_steps))
+        record |= {"repeats": repeat + 1, "rows": [entry.row() for entry in measured]}
+        if arguments.output:
+            before = read_json(arguments.output) if arguments.output.exists() else {}
+            write_record(arguments.output, before | {"agents": record})
+    for row in record["rows"]:
+        print(
+            f"{row['name']:24} {row['agents_acting']:5.1f} agents {row['world_count']:5} worlds "
+            f"{row['step_us']:12.1f} µs a step {row['agent_steps_per_s']:12.4g} agent-steps/s"
+        )
     if arguments.plot:
         write_bytes(arguments.plot, draw(record))
 
