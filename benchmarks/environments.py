@@ -14,16 +14,13 @@ With --plain only: plain loops of `env.step` without resets, of single environme
 With --small only: environment steps a second of the small ids of several B, whole episodes with
 their resets, and no peers. Gardens are measured by benchmarks/gardens.py.
 
-Peers: Gymnasium steps B of our single environments one after the other ("sync") or in B processes
-("async"). VMAS (github.com/proroklab/VectorizedMultiAgentSimulator), if installed, batches worlds
-of agents in torch; its scenarios with the most agents are counted in agent-steps a second, without
-resets.
+Peers, on a CPU: Gymnasium steps B of our single environments one after the other ("sync") or in B
+processes ("async"). Environments of other libraries are measured by benchmarks/agents_beside.py.
 """
 
 from __future__ import annotations
 
 import gc
-import importlib.util
 import statistics
 import time
 from collections.abc import Callable, Iterator
@@ -350,15 +347,6 @@ def small_table(rows: list[dict[str, Any]]) -> str:
 
 GYMNASIUM_WORLDS, GYMNASIUM_PARTICLES = 8, 1024
 
-VMAS_WORLDS = (32, 1024)
-VMAS_SCENARIOS: tuple[tuple[str, dict[str, int]], ...] = (
-    ("dispersion", {"n_agents": 16, "n_food": 16}),
-    ("dispersion", {"n_agents": 64, "n_food": 64}),
-    ("flocking", {"n_agents": 16}),
-    ("flocking", {"n_agents": 64}),
-)
-VMAS_SECONDS = 3.0
-
 
 def median_time(run: Callable[[], None], device: torch.device, seconds: float) -> float:
     """Return the median time of a call [s], from at least three and about `seconds`."""
@@ -404,57 +392,6 @@ def measure_gymnasium(mode: str, quick: bool) -> dict[str, Any]:
         "step_us": taken * 1e6,
         "particle_steps_per_s": world_count * particle_count / taken,
     }
-
-
-def measure_vmas(
-    scenario: str, keywords: dict[str, int], world_count: int, device: torch.device, quick: bool
-) -> dict[str, Any]:
-    """Return the row of one of VMAS's scenarios."""
-    from vmas import make_env
-
-    env = make_env(
-        scenario=scenario,
-        num_envs=world_count,
-        device=str(device),
-        continuous_actions=True,
-        seed=0,
-        **keywords,
-    )
-    env.reset()
-    generator = torch.Generator(device).manual_seed(0)
-    actions = [
-        torch.rand(
-            world_count, env.get_agent_action_size(agent), generator=generator, device=device
-        )
-        * 2.0
-        - 1.0
-        for agent in env.agents
-    ]
-
-    def run() -> None:
-        env.step(actions)
-
-    taken = median_time(run, device, 0.0 if quick else VMAS_SECONDS)
-    return {
-        "peer": f"vmas {scenario}",
-        "world_count": world_count,
-        "agent_count": len(env.agents),
-        "step_us": taken * 1e6,
-        "agent_steps_per_s": world_count * len(env.agents) / taken,
-    }
-
-
-def peer_rows(device: torch.device, quick: bool) -> Iterator[dict[str, Any]]:
-    """Yield a row for each peer: Gymnasium's on a CPU, and VMAS's on the device."""
-    if device.type == "cpu":
-        for mode in ("sync", "async"):
-            yield measure_gymnasium(mode, quick)
-    if importlib.util.find_spec("vmas") is None:
-        print("vmas is not installed, and is left out: pip install vmas")
-        return
-    for scenario, keywords in VMAS_SCENARIOS[:1] if quick else VMAS_SCENARIOS:
-        for world_count in VMAS_WORLDS[:1] if quick else VMAS_WORLDS:
-            yield measure_vmas(scenario, keywords, world_count, device, quick)
 
 
 def show(row: dict[str, Any]) -> None:
@@ -505,9 +442,10 @@ def main() -> None:
                 show(rows[-1])
     for row in rows if cuda or quick else ():
         add_kernels(row, device, quick)
-    peers = [] if arguments.skip_peers else list(peer_rows(device, quick))
-    for row in peers:
-        show(row)
+    peers: list[dict[str, Any]] = []
+    for mode in () if cuda or arguments.skip_peers else ("sync", "async"):
+        peers.append(measure_gymnasium(mode, quick))
+        show(peers[-1])
     if arguments.output:
         report = {"episode_steps": EPISODE_STEPS, "rows": rows, "peers": peers}
         write_record(arguments.output, {**script_facts(arguments), **report})

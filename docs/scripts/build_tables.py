@@ -22,6 +22,7 @@ each column.
 `record` is the name of a file in `benchmarks/results/` without `.json`, or with `.jsonl`; a path
 from the repository's root is one with a slash and its ending; a pattern (`shipped/*.json`) or
 several names, separated by spaces, make `r` a dictionary of records by file name (without ending).
+`name#entry` is an entry of one record, with its own metadata.
 `rows` is a Python expression over `r`: a list, or a dictionary, whose keys are then called `key`.
 A cell is the text of a Python f-string over the fields of a row (`it` is the row itself). Fields of
 records are attributes as well, and `mean`, `error` (standard error), `option(x, ".0f")` (a dash for
@@ -147,8 +148,9 @@ def made_of(name: str, text: str, folder: Path) -> str:
     lines = [line for line in text.splitlines() if line.strip()]
     spec = {k: v.strip() for k, _, v in (line.partition(":") for line in lines) if k in KEYS}
     columns = [line.split(" | ", 1) for line in lines if line.partition(":")[0] not in KEYS]
-    paths = paths_of(spec["record"])
-    records = [read(path) for path in paths]
+    files, _, entry = spec["record"].partition("#")
+    paths = paths_of(files)
+    records = [read(path)[entry] if entry else read(path) for path in paths]
     r = Fields({path.stem: found for path, found in zip(paths, records, strict=True)})
     r = records[0] if len(records) == 1 else r
     try:
