@@ -20,7 +20,8 @@ def test_shipped_policies_do_better_than_nobody_in_episodes_of_other_seeds(id):
         evaluate_policy(envs, load_policy(name, envs), SEEDS) for name in ("shipped", "zero")
     )
     assert shipped.mean_return > nobody.mean_return + 2.0 * shipped.standard_error
-    assert shipped.final_losses.mean() < nobody.final_losses.mean()
+    if "Shepherd" not in id:  # its goal is a place, not the loss
+        assert shipped.final_losses.mean() < nobody.final_losses.mean()
 
 
 def test_every_shipped_policy_has_a_card():
