@@ -113,7 +113,7 @@ def load_policy(source: str, env: Any) -> Callable[[Any], Any]:
         source = str(shipped[id])
     policy = NetworkPolicy.load(source, worlds.device)
     seen = getattr(env, "single_observation_space", None) or env.observation_space
-    ends = policy.network[0].in_features, policy.network[-1].out_features
+    ends: Any = policy.network[0].in_features, policy.network[-1].out_features
     wanted = flatdim(seen), flatdim(acted) if isinstance(acted, Box) else 0
     if ends != wanted or policy.parts != tuple(getattr(seen, "spaces", ())):
         raise NPAError(
