@@ -4,6 +4,7 @@ They are imported as `npa_envs.agents` and use the public API only.
 """
 
 from npa_envs.agents.evaluation import Episodes, evaluate_policy
+from npa_envs.agents.network_policies import NetworkPolicy, load_policy, shipped_policies
 from npa_envs.agents.policies import (
     MendPolicy,
     PaintPolicy,
@@ -20,6 +21,7 @@ __all__ = [
     "Episodes",
     "Interface",
     "MendPolicy",
+    "NetworkPolicy",
     "PaintPolicy",
     "Policy",
     "RandomPolicy",
@@ -28,4 +30,6 @@ __all__ = [
     "ZeroPolicy",
     "evaluate_policy",
     "interface_of",
+    "load_policy",
+    "shipped_policies",
 ]

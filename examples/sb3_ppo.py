@@ -9,27 +9,29 @@ import json
 from pathlib import Path
 
 import gymnasium as gym
-import numpy as np
 import torch
 from stable_baselines3 import PPO
 
 import npa_envs  # noqa: F401 (registers the ids)
-from npa_envs.agents import evaluate_policy
-from npa_envs.agents.garden_policies import ScriptedGardener
+from npa_envs.agents import NetworkPolicy, evaluate_policy, load_policy
+from npa_envs.envs.garden.base import GardenTask
 from npa_envs.render import write_webp
 
 parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
 parser.add_argument("--steps", type=int, default=30_000)
+parser.add_argument("--env", default="npa/Gardener2DSmall-v0", help="whose actions are flat")
 parser.add_argument("--curve", type=Path, default=Path("sb3_ppo.json"), help="to write")
+parser.add_argument("--policy", type=Path, help="to write: the policy, .safetensors")
 given = parser.parse_args()
 
 torch.set_num_threads(1)  # small worlds; a busy machine does not slow them down
-name = "npa/Gardener2DSmall-v0"
+name = given.env
 env = gym.make(name, render_mode="rgb_array")
 test_envs = gym.make_vec(name, num_envs=16)
 test_envs.action_space.seed(0)
 piece = min(2048, given.steps)  # steps before PPO learns from them
-model = PPO("MlpPolicy", env, gamma=0.9, n_steps=piece, seed=0, device="cpu")
+network = "MultiInputPolicy" if isinstance(env.observation_space, gym.spaces.Dict) else "MlpPolicy"
+model = PPO(network, env, gamma=0.9, n_steps=piece, seed=0, device="cpu")
 
 
 def policy(observations):
@@ -49,10 +51,14 @@ while model.num_timesteps < given.steps:
 
 results = {
     "learned": curve[-1][1:],
-    "zero": evaluation(lambda seen: np.zeros((len(seen), *env.action_space.shape), np.float32)),
+    "zero": evaluation(load_policy("zero", test_envs)),
     "random": evaluation(lambda _: test_envs.action_space.sample()),
-    "scripted": evaluation(ScriptedGardener(test_envs)),
 }
+if isinstance(env.unwrapped.task, GardenTask):
+    results["scripted"] = evaluation(load_policy("scripted", test_envs))
+if given.policy:
+    command = f"python examples/sb3_ppo.py --env {name} --steps {given.steps}"
+    NetworkPolicy.of_sb3(model).save(given.policy, {"command": command})
 given.curve.write_text(json.dumps({"env": name, "curve": curve, **results}), encoding="utf-8")
 print("returns, " + ", ".join(f"{k}: {mean:.2f} ± {e:.2f}" for k, (mean, e) in results.items()))
 

@@ -14,11 +14,11 @@ import sys
 from pathlib import Path
 
 import numpy as np
-from npa_bench_rows import BenchRow, read_rows, score, scores_in
+from npa_bench_rows import BenchRow, Score, read_rows, score, scores_in
 from page_parts import table, write_or_check
 
 from npa_envs.agents.comparison.npa_bench import METHOD_DESCRIPTIONS, SUITES, Suite, task_name
-from npa_envs.agents.comparison.plan import NOTHING, REFERENCE
+from npa_envs.agents.comparison.plan import REFERENCE
 from npa_envs.measure.benchmark_records import NONE
 from npa_envs.measure.plots import draw_band, legend_of, new_figure, png
 
@@ -28,7 +28,8 @@ PAGE = "npa_bench.md"
 PANELS = 3
 """Panels side by side."""
 
-CAPTION = "Returns of held-out episodes over particle-steps; bands are standard errors."
+SCORES_PICTURE = "npa_bench_scores.png"
+SCORES_CAPTION = "Scores of all methods on all problems of both suites, as in the table below."
 
 NO_ROWS = "No runs are stored yet."
 """What stands where a suite has no rows."""
@@ -64,45 +65,88 @@ def measured(suite: Suite, rows: dict[str, BenchRow]) -> list[str]:
     return [env_id for env_id in suite.budgets if env_id in ran]
 
 
-def scored(suite: Suite, rows: dict[str, BenchRow], group: str) -> str:
-    """Return the scores of all methods on a group of problems, Markdown."""
-    if not {NOTHING, REFERENCE} <= rows.keys():
-        return f"Scores need the rows `{NOTHING}` and `{REFERENCE}`."
-    ids = [env_id for env_id in suite.groups[group] if len(rows[REFERENCE].returns(env_id))]
-    lines = []
-    for method in ranked(rows):
-        found = scores_in(rows, method, ids)
-        if found:
-            cells = [str(score([found[env_id]])) if env_id in found else NONE for env_id in ids]
-            together = str(score(list(found.values()))) if len(found) == len(ids) else NONE
-            lines.append((f"`{method}`", *cells, together))
-    heads = ("Method", *(f"`{task_name(env_id)}`" for env_id in ids), "All")
-    return table(heads, lines) if lines else NO_ROWS
+Scores = dict[tuple[str, str], dict[str, Score]]
+"""Scores of methods by suite and id, or "all GROUP" for all ids of a group of a suite."""
 
 
-def described(rows: dict[str, BenchRow]) -> str:
+def scored(rows: dict[str, dict[str, BenchRow]]) -> Scores:
+    """Return the scores of all methods on the problems that have runs, in the tables' order."""
+    scores: Scores = {}
+    for name, suite in SUITES.items():
+        found = rows[name]
+        for group, members in suite.groups.items():
+            reference = found.get(REFERENCE)
+            ids = [env_id for env_id in members if reference and len(reference.returns(env_id))]
+            of = {method: scores_in(found, method, ids) for method in ranked(found)}
+            for env_id in ids:
+                scores[name, task_name(env_id)] = {
+                    method: score([runs[env_id]]) for method, runs in of.items() if env_id in runs
+                }
+            if ids:
+                scores[name, f"all {group}"] = {
+                    method: score(list(runs.values()))
+                    for method, runs in of.items()
+                    if len(runs) == len(ids)
+                }
+    return scores
+
+
+def described(rows: dict[str, dict[str, BenchRow]]) -> str:
     """Return what the files say of their methods, Markdown."""
     lines = []
-    for method in ranked(rows):
-        runs = rows[method].runs
-        lines.append((f"`{method}`", rows[method].about or NONE, str(len(runs))))
-    return table(("Method", "What it is", "Runs"), lines)
+    for method in ranked(joined(rows)):
+        counts = [str(len(r[method].runs)) if method in r else NONE for r in rows.values()]
+        lines.append((f"`{method}`", joined(rows)[method].about or NONE, *counts))
+    return table(("Method", "What it is", *(f"Runs, `{name}`" for name in rows)), lines)
 
 
-def results(suite: Suite, rows: dict[str, BenchRow]) -> str:
-    """Return all tables of a suite's rows, and its picture, Markdown."""
-    if not rows:
+def joined(rows: dict[str, dict[str, BenchRow]]) -> dict[str, BenchRow]:
+    """Return a row of each method that any suite has."""
+    return {method: row for found in rows.values() for method, row in found.items()}
+
+
+def results(rows: dict[str, dict[str, BenchRow]]) -> str:
+    """Return the tables of methods and of scores, and their picture, Markdown."""
+    methods, lines, last = ranked(joined(rows)), [], ""
+    for (suite, row), found in scored(rows).items():
+        cells = [str(found[method]) if method in found else NONE for method in methods]
+        lines.append((f"`{suite}`" if suite != last else "", row, *cells))
+        last = suite
+    if not lines:
         return NO_ROWS
-    parts = [described(rows)]
-    parts += [f"Scores, {name}:\n\n{scored(suite, rows, name)}" for name in suite.groups]
-    parts += [f"![{CAPTION}](images/{plain_name(suite)}.png)"]
-    return "\n\n".join(parts)
+    scores = table(("Suite", "Id", *(f"`{method}`" for method in methods)), lines)
+    return "\n\n".join((f"![{SCORES_CAPTION}](images/{SCORES_PICTURE})", described(rows), scores))
+
+
+def heat_map(rows: dict[str, dict[str, BenchRow]]) -> bytes:
+    """Return the scores of all methods on all problems as a PNG file."""
+    scores, methods = scored(rows), ranked(joined(rows))
+    values = np.array(
+        [[found[m].middle if m in found else np.nan for m in methods] for found in scores.values()]
+    )
+    figure, grid = new_figure(1, 1, (9.0, 0.36 * len(values) + 1.0))
+    panel = grid[0][0]
+    panel.imshow(np.clip(values, 0.0, 1.0), cmap="YlGn", vmin=0.0, vmax=1.2, aspect="auto")
+    for (k, j), value in np.ndenumerate(values):
+        if np.isfinite(value):
+            colour = "white" if value > 0.7 else "black"
+            panel.text(j, k, f"{value:.2f}", ha="center", va="center", color=colour, fontsize=8)
+    names = [name for name, _ in scores]
+    for name in dict.fromkeys(names):
+        first, count = names.index(name), names.count(name)
+        panel.axhline(first - 0.5, color="black", lw=1.5)
+        middle, right = first + 0.5 * (count - 1), len(methods) - 0.4
+        panel.text(right, middle, name, rotation=270, va="center", fontsize=8)
+    panel.xaxis.tick_top()
+    panel.set_xticks(range(len(methods)), methods, fontsize=8)
+    panel.set_yticks(range(len(names)), [row.removesuffix("-v0") for _, row in scores], fontsize=8)
+    return png(figure)
 
 
 def page(text: str, rows: dict[str, dict[str, BenchRow]]) -> str:
     """Return a page with its tables made anew, from the rows of each suite."""
     parts = {f"problems of {name}": problems(suite) for name, suite in SUITES.items()}
-    parts |= {f"results of {name}": results(suite, rows[name]) for name, suite in SUITES.items()}
+    parts["results"] = results(rows)
     for name, made in parts.items():
         mark = rf"(<!-- made: {name} -->\n).*?(<!-- end -->)"
         assert len(re.findall(mark, text, re.DOTALL)) == 1, f"{PAGE} has one mark {name}"
@@ -157,6 +201,7 @@ def main(arguments: list[str] | None = None, folder: Path = DOCS) -> int:
             if rows[name]:
                 picture = DOCS / "images" / f"{plain_name(suite)}.png"
                 picture.write_bytes(curves(suite, rows[name]))
+        (DOCS / "images" / SCORES_PICTURE).write_bytes(heat_map(rows))
     return write_or_check(folder, made, [PAGE], __doc__, arguments)
 
 

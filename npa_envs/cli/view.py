@@ -35,13 +35,15 @@ class ViewOptions(common.DeviceOptions):
       npa-envs view gecko
       npa-envs view runs/heart
       npa-envs view npa/Morphogenesis2D-v0 --policy gecko
+      npa-envs view npa/Gardener2DSmall-v0 --policy shipped
     """
 
     what: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="RULE|RUN|ENV")] = "gecko"
     """A shipped rule (`npa-envs list`), a rule's file, the folder of a run, or the id of an
     environment: npa/Texture-v0, or MODULE:my/Own-v0 for one that your module registers."""
     policy: str = "zero"
-    """The policy in an environment: "zero", "random", or a rule for it."""
+    """The policy in an environment: "zero", "random", or a rule for it. Where one controller acts,
+    as in gardens: "shipped", or the file of a policy; in gardens also "scripted"."""
     keywords: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME=VALUE")] = ()
     """Keywords of the environment, for example target=dots eps=0.3 eps0=0.3."""
     particle_count: int | None = None

@@ -95,7 +95,7 @@ def load_rule(source: str | Path, *, device: str | torch.device = "cpu") -> NPAR
     try:
         content, ours = b"", path.suffix == ".safetensors"
         if ours:
-            header, weights = _read_ours(path, with_weights=True)
+            header, weights = read_tensors(path)
             fields = {name: _hyper_parameter(header, name, cls) for name, cls in _FIELDS.items()}
             parts = RuleParts(fields, weights)
         else:
@@ -103,12 +103,8 @@ def load_rule(source: str | Path, *, device: str | torch.device = "cpu") -> NPAR
             is_demo = path.suffix == ".json"
             parts = read_demo_json(content, name) if is_demo else read_state_dict(content)
         rule = _rule_of(parts)
-        if ours and header.get("checksum") != _checksum(header, weights):
-            raise NPAError(
-                "the checksum must be that of the weights and of the metadata, got another one: "
-                "the file is damaged, or another program has changed it; copy it again from where "
-                "it came"
-            )
+        if ours:
+            check_checksum(header, weights)
     except NPAError as error:
         raise NPAError(f"cannot load a rule from {shown(str(source))}: {error}") from error
     if not (ours or content.startswith(ZIP_MARK)):
@@ -152,13 +148,10 @@ def save_rule(
             f"a rule's file must end in .safetensors, got {shown(str(path))}: "
             f"use {shown(str(path.with_suffix('.safetensors')))}"
         )
-    header = {"format": FORMAT_NAME, "version": FORMAT_VERSION}
-    header |= {name: json.dumps(value) for name, value in rule.hyper_parameters().items()}
+    header = {name: json.dumps(value) for name, value in rule.hyper_parameters().items()}
     header |= _checked_metadata({} if metadata is None else metadata)
     weights = {k: v.detach().cpu().contiguous() for k, v in rule.state_dict().items()}
-    check_weights(weights)
-    header["checksum"] = _checksum(header, weights)
-    write_bytes(path, _with_sorted_metadata(serialise(weights, metadata=header)))
+    write_tensors(path, FORMAT_NAME, header, weights)
 
 
 def _checked_metadata(metadata: Mapping[str, str]) -> Mapping[str, str]:
@@ -210,7 +203,7 @@ def _with_sorted_metadata(file: bytes) -> bytes:
 def rule_metadata(path: str | Path) -> dict[str, str]:
     """Return the metadata in the header of a file that `save_rule` wrote."""
     try:
-        return _read_ours(checked_path(path), with_weights=False)[0]
+        return read_tensors(checked_path(path), with_weights=False)[0]
     except NPAError as error:
         raise NPAError(f"cannot read the header of {shown(str(path))}: {error}") from error
 
@@ -280,8 +273,20 @@ def _locate(source: str | Path) -> tuple[Path, str | None]:
     )
 
 
-def _read_ours(path: Path, *, with_weights: bool) -> tuple[dict[str, str], dict[str, Tensor]]:
-    """Return the metadata of a file that `save_rule` wrote, and its weights by name.
+def write_tensors(
+    path: Path, format_name: str, metadata: Mapping[str, str], weights: dict[str, Tensor]
+) -> None:
+    """Write metadata and weights, all finite, to a safetensors file with a checksum over both."""
+    check_weights(weights)
+    header = {"format": format_name, "version": FORMAT_VERSION, **metadata}
+    header["checksum"] = _checksum(header, weights)
+    write_bytes(path, _with_sorted_metadata(serialise(weights, metadata=header)))
+
+
+def read_tensors(
+    path: Path, format_name: str = FORMAT_NAME, *, with_weights: bool = True
+) -> tuple[dict[str, str], dict[str, Tensor]]:
+    """Return the metadata of a file of `write_tensors`, and its weights by name, unchecked.
 
     Without `with_weights` there are none.
     """
@@ -295,10 +300,10 @@ def _read_ours(path: Path, *, with_weights: bool) -> tuple[dict[str, str], dict[
         raise NPAError(
             f"this is no safetensors file, or a truncated one ({shown(error)})"
         ) from error
-    if header.get("format") != FORMAT_NAME:
+    if header.get("format") != format_name:
         raise NPAError(
-            f"the metadata's format must be {FORMAT_NAME!r}, got {shown(header.get('format'))}: "
-            "this safetensors file was not written by npa_envs.save_rule"
+            f"the metadata's format must be {format_name!r}, got {shown(header.get('format'))}: "
+            f"this safetensors file has no {format_name.split()[-1]} of npa_envs"
         )
     if header.get("version") != FORMAT_VERSION:
         raise NPAError(
@@ -306,6 +311,16 @@ def _read_ours(path: Path, *, with_weights: bool) -> tuple[dict[str, str], dict[
             f"{shown(header.get('version'))}: upgrade with pip install -U npa-envs"
         )
     return header, weights
+
+
+def check_checksum(header: Mapping[str, str], weights: Mapping[str, Tensor]) -> None:
+    """Raise NPAError unless a file's checksum is that of its metadata and weights."""
+    if header.get("checksum") != _checksum(header, weights):
+        raise NPAError(
+            "the checksum must be that of the weights and of the metadata, got another one: "
+            "the file is damaged, or another program has changed it; copy it again from where "
+            "it came"
+        )
 
 
 def _checksum(header: Mapping[str, str], weights: Mapping[str, Tensor]) -> str:

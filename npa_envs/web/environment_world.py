@@ -8,11 +8,10 @@ from typing import Any
 import gymnasium
 from torch import Tensor
 
-from npa_envs.agents.policies import RandomPolicy, RulePolicy, ZeroPolicy
+from npa_envs.agents.network_policies import load_policy
 from npa_envs.checks import is_whole
 from npa_envs.errors import NPAError, shown, suggest
-from npa_envs.registration import ALL, WORLD_IDS
-from npa_envs.rule.files import load_rule
+from npa_envs.registration import ALL
 from npa_envs.rule.rule import COLOUR_OFFSET
 from npa_envs.tasks.base import Task
 from npa_envs.tasks.damage import DAMAGE_SIZES
@@ -27,17 +26,9 @@ def make_environment(
 ) -> tuple[Any, Callable[[Any], Any]]:
     """Return a Gymnasium environment, and the policy: a function from observations to actions.
 
-    `id` is one of this package or, as MODULE:ID, of a module that registers it. `policy` is "zero",
-    "random", or a rule as for `load_rule`. `keywords` are those of `gymnasium.make`; None counts as
-    not given.
+    `id` is one of this package or, as MODULE:ID, of a module that registers it. `policy` is as for
+    `load_policy`. `keywords` are those of `gymnasium.make`; None counts as not given.
     """
-    if id in WORLD_IDS:
-        raise NPAError(
-            f"environments whose actions are updates of particles can be viewed, got {shown(id)}: "
-            "view the rule that runs its particles instead"
-        )
-    simple = {"zero": ZeroPolicy, "random": RandomPolicy}
-    rule = None if policy in simple else load_rule(policy, device=device).float()
     keywords = {name: value for name, value in keywords.items() if value is not None}
     limit = keywords.get("max_episode_steps", 1)
     if not is_whole(limit) or limit < 1:
@@ -49,14 +40,14 @@ def make_environment(
     try:
         env = gymnasium.make(id, **options, **keywords)
     except (gymnasium.error.Error, ModuleNotFoundError) as error:
-        known = [environment.id for environment in ALL if environment.id not in WORLD_IDS]
-        raise NPAError(f"unknown environment {shown(id)}: {suggest(id, known)}") from error
+        hint = suggest(id, [row.id for row in ALL])
+        raise NPAError(f"unknown environment {shown(id)}: {hint}") from error
     except TypeError as error:
         if isinstance(error, NPAError):
             raise
         what = f"env must be an environment of npa_envs, got {shown(id)}"
         raise NPAError(f"{what}: {error}") from error
-    return env, simple[policy](env) if rule is None else RulePolicy(rule, env)
+    return env, load_policy(policy, env)
 
 
 class EnvironmentWorld(LiveWorld):

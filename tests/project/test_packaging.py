@@ -80,7 +80,7 @@ def test_wheel_holds_every_source_file_the_rules_and_the_license(site: Path) -> 
     targets = ("tasks/targets/drawings", "tasks/targets/built_in_meshes")
     for folder in ("rule/shipped", "rule/initial", *targets, "web/page"):
         sources += (ROOT / "npa_envs" / folder).glob("*.*")
-    kinds = ("*.py", "*.schema.json")
+    kinds = ("*.py", "*.schema.json", "shipped/*")
     mapped = [p for name in _MAPPED_PACKAGES for k in kinds for p in (ROOT / name).rglob(k)]
     expected = {"py.typed", *(p.relative_to(ROOT / "npa_envs").as_posix() for p in sources)}
     expected |= {p.relative_to(ROOT).as_posix() for p in mapped}

@@ -687,8 +687,6 @@ def test_environments_are_made_with_a_policy():
     world.advance()
     assert not np.array_equal(world.frame().positions, before)
     world.close()
-    with pytest.raises(NPAError, match="updates of particles can be viewed, got 'npa/Gardener2DSm"):
-        make_environment("npa/Gardener2DSmall-v0")
     make_environment("npa/Morphogenesis2DSmall-v0")[0].close()
     with pytest.raises(NPAError, match="env must be an environment of npa_envs"):
         EnvironmentWorld(gymnasium.make("CartPole-v1"), lambda observation: 0)

@@ -40,8 +40,8 @@ def test_a_rule_a_run_and_an_environment_are_distinguished(tmp_path):
 
 
 def test_the_environment_and_the_policy_of_the_commands_examples_fit():
-    ((env, policy),) = re.findall(r"npa-envs view (\S+) --policy (\S+)", ViewOptions.__doc__)
-    assert type(make(env, policy=policy)) is EnvironmentWorld
+    for env, policy in re.findall(r"npa-envs view (\S+) --policy (\S+)", ViewOptions.__doc__):
+        assert type(make(env, policy=policy)) is EnvironmentWorld
 
 
 def test_an_environment_gets_the_keywords_that_a_rule_needs():
