@@ -41,10 +41,11 @@ include_patterns = [
     "docs/**.ipynb",
     "benchmarks/results/**.md",
     "npa_envs/rule/shipped/*.md",
+    "agents/shipped/*.md",
     "CONTRIBUTING.md",
     "CHANGELOG.md",
 ]
-exclude_patterns = [".*", "agents", "build", "demo", "dist", "runs", "tests"]
+exclude_patterns = [".*", "build", "demo", "dist", "runs", "tests"]
 
 extensions = [
     "myst_nb",
@@ -90,7 +91,7 @@ LINK = re.compile(r"^(?:- |\| |### )\[[^\]]+\]\(([\w./-]+)\.(?:md|ipynb)\)", re.
 
 def add_menus(_: Sphinx, name: str, source: list[str]) -> None:
     """Add what a page lists to the menu: one part of it for each of the page's sections."""
-    if name.startswith("benchmarks/"):
+    if name.startswith(("benchmarks/", "agents/")):
         source[0] = f"---\norphan: true\n---\n{source[0]}"
     text = source[0]
     if name == root_doc:
