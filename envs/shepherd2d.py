@@ -129,7 +129,7 @@ class ShepherdTask(GardenTask[Shepherd2DEnvConfig]):
             values = axis_turn(first, now)
             aligned = turned_back(x, now[:, :2], values)
         else:
-            values = (now[:, (2, 4)] / first[:, (2, 4)]).sqrt()
+            values = (now[:, 2::2] / first[:, 2::2]).sqrt()
             middle = now[:, None, :2]
             aligned = middle + (x - middle) / values[:, None]
         loss = sum(self.losses(aligned, s).values(), torch.zeros_like(values[:, 0]))

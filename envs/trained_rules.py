@@ -11,16 +11,15 @@ from torch import Tensor
 
 from npa_envs.checks import check_field, check_positive
 from npa_envs.envs.core.config import EnvConfig
-from npa_envs.envs.core.task import Start
-from npa_envs.envs.core.world_state import not_finite
+from npa_envs.envs.core.task import EnvTask, Start
 from npa_envs.envs.core.worlds import BatchedWorlds
 from npa_envs.envs.morphogenesis2d import Morphogenesis2DEnvConfig, PictureConfig, PictureEnvTask
 from npa_envs.errors import NPAError, shown
 from npa_envs.rule.files import load_rule, shipped_rules
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.targets.digit_clouds import Split
-from npa_envs.world.cuda_graph import makes_plain_tensors
-from npa_envs.world.environment_steps import hold_in_bounds
+from npa_envs.world.cuda_graph import GraphedCallable, makes_plain_tensors
+from npa_envs.world.environment_steps import flag_unless_finite, hold_in_bounds, load_async
 from npa_envs.world.particles import Particles, combined
 from npa_envs.world.randomness import StreamId, WorldRandom
 from npa_envs.world.rollout import rollout_particles
@@ -183,20 +182,42 @@ class RuleDrivenWorlds(BatchedWorlds):
     context: Any = None
     """Context of all worlds' episodes, see `RuleDrivenTask`; None before the first start."""
 
+    @makes_plain_tensors
+    def __init__(
+        self,
+        task_type: type[EnvTask[Any]],
+        config: EnvConfig,
+        world_count: int,
+        episode_steps: int | None = None,
+    ) -> None:
+        super().__init__(task_type, config, world_count, episode_steps)
+        self.random_steps = self.task.config.rule_steps
+        self._action: Tensor | None = None
+        self._graph = GraphedCallable(self._step_and_observe, self.device)
+
     @torch.no_grad()
     @makes_plain_tensors
     def queue(self, action: Tensor, out: Tensor | None = None) -> Tensor:
-        """Make a step of finite actions; return observations, [B, O], in `out` if it is given."""
-        if not bool(torch.isfinite(action).all()):
-            raise not_finite(action)
-        action = action.to(self.device)
-        x, s = self._stepped(action)
-        self.particles.copy_(Particles(x, s))
-        hold_in_bounds(self.x, self.s, self.physics, self.diverged)
-        self.evaluate()
+        """Step the worlds without synchronising; return observations, in `out` if it is given."""
+        if self._action is None:
+            self._action = torch.zeros(action.shape, device=self.device)
+        load_async(action, self._action)
+        flag_unless_finite(self._action, self.enabled)
+        self._graph()
         if self.side_stream is not None:
             self.side_stream.mark()
-        return self.perceive(out)
+        return self._observed.clone() if out is None else out.copy_(self._observed)
+
+    def _step_and_observe(self) -> None:
+        """Make the step of the loaded actions, if these are finite; captured on CUDA."""
+        is_made = self.enabled.bool()
+        assert self._action is not None, "queue makes it"
+        stepped = self._stepped(torch.where(is_made, self._action, 0.0))
+        for value, new in zip(self.particles[:2], stepped, strict=True):
+            torch.where(is_made, new, value, out=value)
+        hold_in_bounds(self.x, self.s, self.physics, self.diverged)
+        self.evaluate()
+        self._observed = self.task.observe(self.particles, self.loss, self.context)
 
     def _stepped(self, action: Tensor) -> tuple[Tensor, Tensor]:
         x, s = self.x, self.s
@@ -210,7 +231,7 @@ class RuleDrivenWorlds(BatchedWorlds):
             for part, random in zip(parts, streams, strict=True)
         ]
         # All streams have advanced by as many random numbers.
-        self.random.sync_with(streams[-1], self.task.config.rule_steps)
+        self.random.sync_with(streams[-1], self.random_steps)
         x, s = (torch.cat(part) for part in zip(*worlds, strict=True))
         return x, s
 

@@ -36,6 +36,7 @@ from npa_envs.world.environment_steps import (
     Actions,
     EpisodeRules,
     NeighbourState,
+    flag_unless_finite,
 )
 from npa_envs.world.particles import Particles
 from npa_envs.world.randomness import WorldRandom
@@ -55,6 +56,9 @@ class BatchedWorlds(WorldState):
     | `begin` | `start` | `place`, then a new episode |
     | `place` | `place_particles`, `begin` | replaces particles, goals and losses |
     """
+
+    random_steps = 1
+    """Steps by which `queue` advances the random streams."""
 
     @makes_plain_tensors
     def __init__(
@@ -182,7 +186,7 @@ class BatchedWorlds(WorldState):
         read: NDArray[np.uint8] = self.episodes.host_ending_bits.numpy()
         if not read[-1]:
             # The step was not made: the next one draws its random numbers again.
-            self.random.undo_advance()
+            self.random.undo_advance(self.random_steps)
             raise not_finite(action)
         ending_bits = read[:-1].copy()
         if (ending_bits & NOT_FINITE).any():
@@ -369,10 +373,9 @@ class CentralWorlds(ParticleWorlds):
     @makes_plain_tensors
     def queue(self, action: Tensor, out: Tensor | None = None) -> Tensor:
         """Step worlds by finite actions, [B, P², A]; return pictures, in `out` if it is given."""
-        if not bool(torch.isfinite(action).all()):
-            raise not_finite(action)
-        size = self.task.config.place_count
-        rows = action.to(self.device).reshape(self.world_count, size, size, -1)
+        size, action = self.task.config.place_count, action.to(self.device)
+        flag_unless_finite(action, self.enabled)
+        rows = action.reshape(self.world_count, size, size, -1)
         grid, where = rows.permute(0, 3, 1, 2), self._in_square()[:, :, None]
         sampled = F.grid_sample(grid, where, padding_mode="border", align_corners=True)
         self.steps.act(sampled[..., 0].transpose(1, 2).contiguous())

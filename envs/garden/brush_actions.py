@@ -195,9 +195,10 @@ def apply_brushes(
     if "wipe" in config.tools:
         s = s * (1.0 - total[..., columns.wipe].clamp(0.0, 1.0))
     if "inject" in config.tools:
-        channels = [channel % config.state_dim for channel in config.inject_channels]
-        index = torch.tensor(channels, device=s.device)
-        s = s.index_add(2, index, config.state_scale * total[..., columns.inject])
+        s, amounts = s.clone(), config.state_scale * total[..., columns.inject]
+        # One by one: a tensor of the channels would be copied to the device.
+        for channel, amount in zip(config.inject_channels, amounts.unbind(dim=-1), strict=True):
+            s[..., channel] += amount
     rate = (1.0 + total[..., columns.rate]).clamp(0.0, 2.0) if "rate" in config.tools else None
     return particles._replace(x=x, s=s), rate
 

@@ -22,7 +22,7 @@ from npa_envs.kernels.portable.update import (
     update_kernels,
 )
 from npa_envs.ops.custom_op import check_derivatives, custom_op, once_differentiable
-from npa_envs.ops.launch import SCALARS, RecordedLaunches, is_aligned, launch
+from npa_envs.ops.launch import SCALARS, RecordedLaunches, aligned, is_aligned, launch
 from npa_envs.ops.perceive import Rows
 from npa_envs.ops.physics import Physics
 from npa_envs.ops.sort import MAX_INDEX
@@ -304,6 +304,21 @@ def apply_actions(
     launch(*worlds.launch_of(action, physics, is_aligned(s) and is_aligned(action)))
 
 
+def load_async(values: Tensor, buffer: Tensor) -> None:
+    """Copy values of any dtype and device into a buffer of their shape, without waiting."""
+    if buffer.is_cuda and not values.is_cuda:
+        # A copy from memory that is not pinned would wait for the device.
+        values = values.to(buffer.dtype).pin_memory()
+    buffer.copy_(values, non_blocking=True)
+
+
+def flag_unless_finite(values: Tensor, enabled: Tensor) -> None:
+    """Set `enabled`, uint8 [1], to 0 if a value is not finite, without waiting for the device."""
+    values, threads = aligned(values), -(-values.numel() // VALUES_PER_THREAD)
+    check = flag_not_finite(SCALARS[values.dtype])
+    launch(check, threads, values.device, threads, values, enabled)
+
+
 class PreparedActions:
     """Applies actions as `apply_actions`, to worlds in fixed tensors, by recorded launches.
 
@@ -336,15 +351,11 @@ class PreparedActions:
 
     def load(self, action: Tensor) -> None:
         """Copy actions of any dtype and device into the buffer that `apply_loaded` reads."""
-        buffer = self._buffer
-        if action.shape != buffer.shape:
+        if action.shape != self._buffer.shape:
             raise NPAError(
-                f"action must have shape {tuple(buffer.shape)}, got {tuple(action.shape)}"
+                f"action must have shape {tuple(self._buffer.shape)}, got {tuple(action.shape)}"
             )
-        if buffer.is_cuda and not action.is_cuda:
-            # A copy from memory that is not pinned would wait for the device.
-            action = action.to(buffer.dtype).pin_memory()
-        buffer.copy_(action, non_blocking=True)
+        load_async(action, self._buffer)
 
     def apply_loaded(self) -> None:
         """Apply the actions of the last `load`; may be captured in a CUDA graph."""

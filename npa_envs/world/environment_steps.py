@@ -24,6 +24,8 @@ from npa_envs.ops.rewards_and_ends import EpisodeRules as EpisodeRules
 from npa_envs.ops.rewards_and_ends import EpisodeUpdate as EpisodeUpdate
 from npa_envs.ops.species_density import perceive_by_species
 from npa_envs.ops.update import ActedWorlds, PreparedActions
+from npa_envs.ops.update import flag_unless_finite as flag_unless_finite
+from npa_envs.ops.update import load_async as load_async
 from npa_envs.ops.update import wrapped as wrapped
 from npa_envs.ops.world_mean import world_mean as world_mean
 from npa_envs.world.randomness import WorldRandom

@@ -128,9 +128,9 @@ class WorldRandom:
         self.steps += checked_count("steps", steps)
         self._draw_count = 0
 
-    def undo_advance(self) -> None:
-        """Go back by one step, whose random numbers the next `advance` repeats."""
-        self.steps -= 1
+    def undo_advance(self, steps: int = 1) -> None:
+        """Go back by a number of steps, whose random numbers the next `advance` repeats."""
+        self.steps -= steps
 
     def restart(self) -> None:
         """Begin the next episode of every world at step 0, in place, with new random numbers."""
