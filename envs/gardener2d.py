@@ -13,7 +13,7 @@ from npa_envs.envs.core.vector import vector_class
 from npa_envs.envs.garden.base import GardenEnv, GardenTask, StartLosses
 from npa_envs.envs.garden.brush_actions import GardenConfig
 from npa_envs.tasks.damage import random_particle
-from npa_envs.world.brushes import sums_under_brushes, wipe_state
+from npa_envs.world.brushes import gusts_and_blights, sums_under_brushes, wipe_state
 from npa_envs.world.particles import Particles
 from npa_envs.world.randomness import StreamId, WorldRandom
 
@@ -61,6 +61,13 @@ class GardenerTask(GardenTask[Gardener2DEnvConfig]):
         """Return worlds after a random gust and a random blight, of the given chances."""
         x, s, *_ = particles
         config, random = self.config, random.substream(StreamId.DAMAGE)
+        if not (torch.is_grad_enabled() and (x.requires_grad or s.requires_grad)):
+            # The same by one launch.
+            chances = config.gust_chance, config.blight_chance
+            radii = config.gust_radius, config.blight_radius
+            blown = {"length": config.gust_length, "chances": chances, "radii": radii}
+            x, hit = gusts_and_blights(x, random, **blown, box=self.periodic_sides)
+            return particles._replace(x=x, s=s.masked_fill(hit[..., None], 0.0))
         chance, angle = random.uniform(2), 2.0 * math.pi * random.uniform(1)
         centre = random_particle(x, random)
         happens = (chance[:, :1] < config.gust_chance).to(x.dtype)

@@ -293,8 +293,8 @@ class _ArrayArgument:
         self._size: tuple[int, ...] | None = None
         """Shape of the described tensor; (): describe the next one again; None: it is absent."""
         self._dtype: torch.dtype | None = None
-        self._dense: dict[tuple[Any, Any], Any] = {}
-        """Descriptors of contiguous tensors by shape and dtype."""
+        self._described: dict[tuple[Any, ...], Any] = {}
+        """Descriptors by shape, dtype and, unless tensors are contiguous, strides."""
 
     def set(self, tensor: Tensor | None) -> None:
         """Write a tensor's address, and its shape if that changed; None: an absent array."""
@@ -306,11 +306,12 @@ class _ArrayArgument:
             return
         size, dense = tensor.shape, tensor.is_contiguous()
         if size != self._size or tensor.dtype is not self._dtype or not dense:
-            described = self._dense.get((size, tensor.dtype)) if dense else None
+            key = size, tensor.dtype, None if dense else tensor.stride()
+            described = self._described.get(key)
             if described is None:
                 described = _array_descriptor(tensor, self._type)
-                if dense and len(self._dense) < MAX_DESCRIPTORS:
-                    self._dense[size, tensor.dtype] = described
+                if len(self._described) < MAX_DESCRIPTORS:
+                    self._described[key] = described
             _overwrite(self._descriptor, described)
             self._size, self._dtype = size if dense else (), tensor.dtype
         self._descriptor.data = tensor.data_ptr() or _empty_address(tensor)

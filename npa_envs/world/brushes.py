@@ -19,7 +19,10 @@ from torch import Tensor
 from npa_envs.checks import as_list, check_alike, check_world, checked_number
 from npa_envs.errors import NPAError, shown
 from npa_envs.ops.brush_sums import brush_sums
+from npa_envs.ops.gusts import blow
+from npa_envs.ops.random_numbers import draw
 from npa_envs.ops.world_mean import world_mean
+from npa_envs.world.randomness import WorldRandom
 
 Sides = tuple[float, ...] | None
 
@@ -90,6 +93,27 @@ def sums_under_brushes(
         terms = torch.cat((torch.ones_like(weights), away, terms), dim=-1)
     sums = points.shape[1] * world_mean((weights * terms).transpose(1, 2).flatten(2))
     return sums.view(*centres.shape[:2], -1)
+
+
+def gusts_and_blights(
+    x: Tensor,
+    random: WorldRandom,
+    *,
+    length: float,
+    chances: tuple[float, float],
+    radii: tuple[float, float],
+    box: Sides = None,
+) -> tuple[Tensor, Tensor]:
+    """Return positions after random gusts, [B, N, 2], and which particles blights hit, bool [B, N].
+
+    Without gradient, by two draws of `random` and a launch. `length`: how far a gust moves what is
+    in its centre [length units]; `chances` and `radii` [length units] are the gust's, the blight's.
+    """
+    streams = random.keys, random.episodes, random.steps
+    angle = 2.0 * math.pi * draw(*streams, 1, "uniform", 1, x.dtype, 0)
+    moves = length * torch.cat((angle.cos(), angle.sin()), dim=1)
+    sides = [*(box or (0.0, 0.0))]
+    return blow(x.contiguous(), *streams, moves, [*chances], [*radii], sides)
 
 
 def push(
