@@ -76,6 +76,8 @@ class StepReport(NamedTuple):
     """Reward, loss, its terms and their decreases, float32, shape [2 + 2 terms, B]."""
     flags: Tensor
     """Terminated, truncated, success, diverged, True, and unused rows, bool, shape [8, B]."""
+    named: StepNumbers
+    """The rows of `numbers` by name."""
 
     @classmethod
     def empty(cls, world_count: int, term_count: int, device: torch.device) -> StepReport:
@@ -89,17 +91,13 @@ class StepReport(NamedTuple):
     def from_buffer(cls, buffer: Tensor) -> StepReport:
         """Return a `StepReport` whose tensors are views of `buffer`, float32."""
         flags = buffer[-FLAG_ROWS:].view(torch.bool).view(-1, buffer.shape[1])
-        return cls(buffer, buffer[:-FLAG_ROWS], flags)
+        numbers = buffer[:-FLAG_ROWS]
+        return cls(buffer, numbers, flags, StepNumbers.from_rows(numbers))
 
     @property
     def end_flags(self) -> Tensor:
         """Terminated, truncated, success, diverged, bool, shape [4, B]."""
         return self.flags[:TRUE_ROW]
-
-    @property
-    def named(self) -> StepNumbers:
-        """The rows of `numbers` by name."""
-        return StepNumbers.from_rows(self.numbers)
 
     def __reduce__(self) -> tuple[Callable[..., Any], tuple[Any, ...]]:
         # Unpickled views would not share the buffer's memory.
