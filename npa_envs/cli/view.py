@@ -119,7 +119,7 @@ def world_maker(options: ViewOptions, device: torch.device) -> Callable[[], Live
 
         def make_world() -> LiveWorld:
             env, acting = make_environment(options.what, policy, device=str(device), **keywords)
-            return EnvironmentWorld(env, acting, seed=options.seed)
+            return EnvironmentWorld(env, acting, seed=options.seed, policy_name=policy)
 
         return make_world
     if options.policy != "zero" or options.keywords:

@@ -53,8 +53,11 @@ def make_environment(
 class EnvironmentWorld(LiveWorld):
     """The world of an environment whose actions a policy chooses; `make_environment` makes both."""
 
-    def __init__(self, env: Any, policy: Callable[[Any], Any], *, seed: int = 0) -> None:
+    def __init__(
+        self, env: Any, policy: Callable[[Any], Any], *, seed: int = 0, policy_name: str = ""
+    ) -> None:
         super().__init__(seed)
+        self._acting = f"policy {policy_name}, " if policy_name else ""
         self._env, self._inner, self._policy = env, env.unwrapped, policy
         if not hasattr(self._inner, "place_particles"):
             raise NPAError(
@@ -79,13 +82,15 @@ class EnvironmentWorld(LiveWorld):
         return box
 
     def describe(self) -> WorldEvent:
-        """Return the event "world"; the note has the number and the end of episodes."""
+        """Return the event "world"; the note: policy, number of the episode, end of the last."""
         task = self._inner.task
+        # Brushes and gusts carry particles out of the picture.
+        margin = 1.25 if task.controls == "brushes" else 1.0
         event: WorldEvent = super().describe() | {
             "title": self._env.spec.id if self._env.spec is not None else type(self._env).__name__,
-            "note": f"episode {self._episode}{self._ended}",
+            "note": f"{self._acting}episode {self._episode}{self._ended}",
             "dimension": self._physics.space_dim,
-            "half_width": task.half_width if self.box is None else 0.5 * min(self.box),
+            "half_width": margin * task.half_width if self.box is None else 0.5 * min(self.box),
             "spot": 0.7 * float(task.pixel_size),
             "class_count": int(getattr(task.config, "class_count", 0)),
             "damages": list(DAMAGE_SIZES) if self._physics.moving else ["wipe"],
