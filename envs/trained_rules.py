@@ -11,7 +11,7 @@ from torch import Tensor
 
 from npa_envs.checks import check_field, check_positive
 from npa_envs.envs.core.config import EnvConfig
-from npa_envs.envs.core.task import EnvTask, Start
+from npa_envs.envs.core.task import Start
 from npa_envs.envs.core.worlds import BatchedWorlds
 from npa_envs.envs.morphogenesis2d import Morphogenesis2DEnvConfig, PictureConfig, PictureEnvTask
 from npa_envs.errors import NPAError, shown
@@ -182,25 +182,16 @@ class RuleDrivenWorlds(BatchedWorlds):
     context: Any = None
     """Context of all worlds' episodes, see `RuleDrivenTask`; None before the first start."""
 
-    @makes_plain_tensors
-    def __init__(
-        self,
-        task_type: type[EnvTask[Any]],
-        config: EnvConfig,
-        world_count: int,
-        episode_steps: int | None = None,
-    ) -> None:
-        super().__init__(task_type, config, world_count, episode_steps)
-        self.random_steps = self.task.config.rule_steps
-        self._action: Tensor | None = None
-        self._graph = GraphedCallable(self._step_and_observe, self.device)
+    _graph: GraphedCallable | None = None
 
     @torch.no_grad()
     @makes_plain_tensors
     def queue(self, action: Tensor, out: Tensor | None = None) -> Tensor:
         """Step the worlds without synchronising; return observations, in `out` if it is given."""
-        if self._action is None:
+        if self._graph is None:
             self._action = torch.zeros(action.shape, device=self.device)
+            self._graph = GraphedCallable(self._step_and_observe, self.device)
+            self.random_steps = self.task.config.rule_steps
         load_async(action, self._action)
         flag_unless_finite(self._action, self.enabled)
         self._graph()
@@ -211,7 +202,6 @@ class RuleDrivenWorlds(BatchedWorlds):
     def _step_and_observe(self) -> None:
         """Make the step of the loaded actions, if these are finite; captured on CUDA."""
         is_made = self.enabled.bool()
-        assert self._action is not None, "queue makes it"
         stepped = self._stepped(torch.where(is_made, self._action, 0.0))
         for value, new in zip(self.particles[:2], stepped, strict=True):
             torch.where(is_made, new, value, out=value)

@@ -1,10 +1,11 @@
-"""Sums over the points under brushes as a torch operator, without gradients."""
+"""Sums over the points under brushes, and gusts, as torch operators, without gradients."""
 
 from __future__ import annotations
 
+import torch
 from torch import Tensor
 
-from npa_envs.kernels.portable.brush_sums import brush_kernel
+from npa_envs.kernels.portable.brush_sums import brush_kernel, gust_kernel
 from npa_envs.ops.custom_op import custom_op
 from npa_envs.ops.launch import SCALARS, launch
 
@@ -25,3 +26,26 @@ def brush_sums(
     places = centres.contiguous(), points.contiguous()
     launch(kernel, tuple(size), points.device, radius, tuple(box), *places, values, sums)
     return sums
+
+
+@custom_op("npa::blow")
+def blow(
+    x: Tensor,
+    streams: list[Tensor],
+    moves: Tensor,
+    chances: list[float],
+    radii: list[float],
+    box: list[float],
+) -> tuple[Tensor, Tensor]:
+    """Return positions after gusts, [B, N, 2], and which particles blights hit, bool, [B, N].
+
+    By the first of two `chances` a gust carries particles around a random one by `moves`, [B, 2],
+    as `push` does with the first of the `radii`. By the second, a blight hits those within the
+    second radius of a random one. `streams`: keys, episodes and steps as `draw` takes them.
+    """
+    moved, hit = torch.empty_like(x), x.new_empty(x.shape[:2], dtype=torch.uint8)
+    lanes = x.shape[1] if x.is_cuda else 1
+    numbers = tuple(chances), tuple(radii), tuple(box), lanes
+    arrays, size = (*streams, moves, x, moved, hit), (x.shape[0], lanes)
+    launch(gust_kernel(SCALARS[x.dtype]), size, x.device, *numbers, *arrays)
+    return moved, hit.view(torch.bool)

@@ -18,8 +18,7 @@ from torch import Tensor
 
 from npa_envs.checks import as_list, check_alike, check_world, checked_number
 from npa_envs.errors import NPAError, shown
-from npa_envs.ops.brush_sums import brush_sums
-from npa_envs.ops.gusts import blow
+from npa_envs.ops.brush_sums import blow, brush_sums
 from npa_envs.ops.random_numbers import draw
 from npa_envs.ops.world_mean import world_mean
 from npa_envs.world.randomness import WorldRandom
@@ -109,11 +108,11 @@ def gusts_and_blights(
     Without gradient, by two draws of `random` and a launch. `length`: how far a gust moves what is
     in its centre [length units]; `chances` and `radii` [length units] are the gust's, the blight's.
     """
-    streams = random.keys, random.episodes, random.steps
+    streams = [random.keys, random.episodes, random.steps]
     angle = 2.0 * math.pi * draw(*streams, 1, "uniform", 1, x.dtype, 0)
     moves = length * torch.cat((angle.cos(), angle.sin()), dim=1)
     sides = [*(box or (0.0, 0.0))]
-    return blow(x.contiguous(), *streams, moves, [*chances], [*radii], sides)
+    return blow(x.contiguous(), streams, moves, [*chances], [*radii], sides)
 
 
 def push(

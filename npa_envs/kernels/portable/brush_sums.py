@@ -1,4 +1,5 @@
-"""Sums over the points under brushes, which hold points by (1 - r²)² at r radii from their centre.
+"""Sums over the points under brushes, which hold points by (1 - r²)² at r radii from their centre;
+and gusts, which move particles as a brush does, with blights, which hit those in a ball.
 
 Arguments: see `kernels/portable/__init__.py`.
 """
@@ -12,6 +13,7 @@ from npa_envs.kernels import native_functions as native
 from npa_envs.kernels.domain import scalar_name
 from npa_envs.kernels.lanes_and_memory import wait_for_previous_kernel
 from npa_envs.kernels.native_functions import WORLDS, in_ranges
+from npa_envs.kernels.portable.random_numbers import ULP_24, joined, world_words
 
 
 @cached_under_lock()
@@ -84,3 +86,62 @@ def brush_kernel(scalar: type, width: int, moments: bool) -> wp.Kernel:
             sums[world, j, c] = scalar(total[c])
 
     return sum_under_brushes
+
+
+@cached_under_lock()
+def gust_kernel(scalar: type) -> wp.Kernel:
+    """Return the kernel of gusts and blights in 2D; `lanes` threads share a world."""
+    vector = wp.types.vector(2, scalar)
+    brush = brush_functions(scalar)
+
+    @wp.func
+    def gusted(position: vector, centre: vector, move: vector, inverse_radius: scalar, box: vector):
+        """Return a position moved by a brush at `centre`."""
+        weight = brush.weight(inverse_radius * brush.nearest_image(centre - position, box))
+        for d in range(2):
+            position[d] += scalar(weight * wp.float64(move[d]))
+        return position
+
+    @in_ranges(WORLDS)
+    @wp.kernel(module=native.module(f"npa_envs.kernels.gusts_{scalar_name(scalar)}"))
+    def blow(
+        range_start: int,
+        chances: vector,
+        radii: vector,
+        box: vector,
+        lanes: int,
+        keys: wp.array[wp.int64],
+        episodes: wp.array[wp.int32],
+        steps: wp.array[wp.int32],
+        moves: wp.array[vector],
+        positions: wp.array2d[vector],
+        # outputs
+        moved: wp.array2d[vector],
+        hit: wp.array2d[wp.uint8],
+    ):
+        """Write positions after gusts by `moves`, then which particles blights hit."""
+        wait_for_previous_kernel()
+        world, lane = wp.tid()
+        world += range_start
+        count = positions.shape[1]
+        # Draw 0 has the chances, 2 and 3 the particles in the middle; 1 is the direction.
+        drawn = world_words(world, 0, 0, keys, episodes, steps)
+        move = moves[world]
+        if scalar(wp.float32(drawn[0] >> wp.uint32(8)) * ULP_24) >= chances[0]:
+            move *= scalar(0.0)
+        radius = scalar(-1.0)
+        if scalar(wp.float32(drawn[1] >> wp.uint32(8)) * ULP_24) < chances[1]:
+            radius = radii[1]
+        inverse = scalar(1.0) / radii[0]
+        drawn = world_words(world, 0, 2, keys, episodes, steps)
+        gust = positions[world, wp.int32(joined(drawn[0], drawn[1]) % wp.uint64(count))]
+        drawn = world_words(world, 0, 3, keys, episodes, steps)
+        blight = positions[world, wp.int32(joined(drawn[0], drawn[1]) % wp.uint64(count))]
+        blight = gusted(blight, gust, move, inverse, box)
+        for i in range(lane, count, lanes):
+            position = gusted(positions[world, i], gust, move, inverse, box)
+            moved[world, i] = position
+            away = brush.nearest_image(position - blight, box)
+            hit[world, i] = wp.uint8(wp.where(wp.length(away) <= radius, 1, 0))
+
+    return blow
