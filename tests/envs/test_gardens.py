@@ -66,6 +66,31 @@ def test_brushes_do_what_the_documentation_says():
     assert torch.allclose(rate[0, :, 0], 1.0 - held)
 
 
+@pytest.mark.parametrize("fields", [{}, {"boundary": "periodic", "box_size": 1.5}], ids=["open", "box"])
+def test_gusts_and_blights_are_the_same_with_a_gradient(fields):
+    fields |= {"gust_chance": 0.6, "gust_radius": 0.8, "blight_radius": 0.6}
+    task, count = make(GARDENER, **fields).unwrapped.task, 32
+    random = npa_envs.WorldRandom(range(count))
+    x, s = random.normal(50, 2), random.normal(50, 16)
+    moved, wiped, *_ = task.disturb(Particles(x, s), random)
+    slow_moved, slow_wiped, *_ = task.disturb(Particles(x.clone().requires_grad_(), s), random)
+    torch.testing.assert_close(moved, slow_moved.detach())
+    assert torch.equal(wiped, slow_wiped)
+    assert 0 < (moved != x).any(dim=2).any(dim=1).sum() < count
+    assert 0 < (wiped != s).any(dim=2).any(dim=1).sum() < count
+
+
+def test_actions_that_are_not_finite_change_neither_worlds_nor_their_random_numbers():
+    envs = [make_vec(GARDENER, 2) for _ in range(2)]
+    for env in envs:
+        env.reset(seed=3)
+    first, second = sampled(envs[0], 2)
+    bad = np.where(np.arange(first.size).reshape(first.shape) == 5, np.inf, first)
+    for action in (first, second):
+        refused("action must be finite, got inf at world 0", envs[0].step, bad)
+        assert_same(envs[0].step(action), envs[1].step(action))
+
+
 @pytest.mark.parametrize("name", [GARDENER, SHEPHERD, "npa/Shapeshifter2D-v0"])
 def test_a_world_is_the_same_alone_and_among_others_that_are_stepped_with_it(name, monkeypatch):
     count, fields = 5, {"particle_count": 250}

@@ -640,7 +640,7 @@ def test_the_speed_of_a_step_across_an_edge_of_the_box_is_that_of_the_step():
 @pytest.fixture
 def episodes():
     env = small_environment("npa/Morphogenesis2D-v0", max_episode_steps=3)
-    world = EnvironmentWorld(env, ZeroPolicy(env))
+    world = EnvironmentWorld(env, ZeroPolicy(env), policy_name="zero")
     yield world
     world.close()
 
@@ -654,7 +654,8 @@ def test_episodes_follow_each_other(episodes):
     curve, description = episodes.take_events()
     assert curve["name"] == "Return"
     assert curve["points"][0][0] == 1
-    assert description["note"].startswith("episode 2; the last one ended after 3 steps: time limit")
+    ending = "the last one ended after 3 steps: time limit"
+    assert description["note"].startswith(f"policy zero, episode 2; {ending}")
     assert episodes.frame().step == 0
     assert not np.array_equal(episodes.frame().positions, first)
     episodes.handle({"type": "reset", "seed": 0})
