@@ -13,7 +13,7 @@ from npa_envs.envs.core.vector import vector_class
 from npa_envs.envs.garden.base import GardenEnv, GardenTask, StartLosses
 from npa_envs.envs.garden.brush_actions import GardenConfig
 from npa_envs.tasks.damage import random_particle
-from npa_envs.world.brushes import gusts_and_blights, sums_under_brushes, wipe_state
+from npa_envs.world.brushes import blow, sums_under_brushes, wipe_state
 from npa_envs.world.particles import Particles
 from npa_envs.world.randomness import StreamId, WorldRandom
 
@@ -61,24 +61,20 @@ class GardenerTask(GardenTask[Gardener2DEnvConfig]):
         """Return worlds after a random gust and a random blight, of the given chances."""
         x, s, *_ = particles
         config, random = self.config, random.substream(StreamId.DAMAGE)
-        if not (torch.is_grad_enabled() and (x.requires_grad or s.requires_grad)):
-            # The same by one launch.
-            chances = config.gust_chance, config.blight_chance
-            radii = config.gust_radius, config.blight_radius
-            blown = {"length": config.gust_length, "chances": chances, "radii": radii}
-            x, hit = gusts_and_blights(x, random, **blown, box=self.periodic_sides)
-            return particles._replace(x=x, s=s.masked_fill(hit[..., None], 0.0))
         chance, angle = random.uniform(2), 2.0 * math.pi * random.uniform(1)
-        centre = random_particle(x, random)
         happens = (chance[:, :1] < config.gust_chance).to(x.dtype)
         move = config.gust_length * happens * torch.cat((angle.cos(), angle.sin()), dim=1)
-        box = self.periodic_sides
-        # As `push`, by one launch.
-        gust = centre[:, None], move[:, None]
-        x = x + sums_under_brushes(x, *gust, radius=config.gust_radius, box=box)
         # A negative radius wipes nothing.
-        centre = random_particle(x, random)
         radius = torch.where(chance[:, 1] < config.blight_chance, config.blight_radius, -1.0)
+        box = self.periodic_sides
+        if not (torch.is_grad_enabled() and (x.requires_grad or s.requires_grad)):
+            # The lines below by one launch.
+            x, hit = blow(x, random, move, radius, gust_radius=config.gust_radius, box=box)
+            return particles._replace(x=x, s=s.masked_fill(hit[..., None], 0.0))
+        # As `push`, by one launch.
+        gust = random_particle(x, random)[:, None], move[:, None]
+        x = x + sums_under_brushes(x, *gust, radius=config.gust_radius, box=box)
+        centre = random_particle(x, random)
         s = wipe_state(x, s, centre=centre, radius=radius, box=box)
         return particles._replace(x=x, s=s)
 

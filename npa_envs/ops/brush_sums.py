@@ -28,24 +28,17 @@ def brush_sums(
     return sums
 
 
-@custom_op("npa::blow")
-def blow(
-    x: Tensor,
-    streams: list[Tensor],
-    moves: Tensor,
-    chances: list[float],
-    radii: list[float],
-    box: list[float],
+@custom_op("npa::gusts")
+def gusts(
+    x: Tensor, streams: list[Tensor], moves: Tensor, hits: Tensor, radius: float, box: list[float]
 ) -> tuple[Tensor, Tensor]:
-    """Return positions after gusts, [B, N, 2], and which particles blights hit, bool, [B, N].
+    """Return positions after gusts, [B, N, 2], and which particles are hit then, bool, [B, N].
 
-    By the first of two `chances` a gust carries particles around a random one by `moves`, [B, 2],
-    as `push` does with the first of the `radii`. By the second, a blight hits those within the
-    second radius of a random one. `streams`: keys, episodes and steps as `draw` takes them.
+    A gust carries particles around a random one by `moves`, [B, 2], as `push` does with `radius`;
+    `hits` are radii around another one, [B]. `streams`: keys, episodes and steps as for `draw`.
     """
     moved, hit = torch.empty_like(x), x.new_empty(x.shape[:2], dtype=torch.uint8)
     lanes = x.shape[1] if x.is_cuda else 1
-    numbers = tuple(chances), tuple(radii), tuple(box), lanes
-    arrays, size = (*streams, moves, x, moved, hit), (x.shape[0], lanes)
-    launch(gust_kernel(SCALARS[x.dtype]), size, x.device, *numbers, *arrays)
+    arrays, size = (*streams, moves, hits, x, moved, hit), (x.shape[0], lanes)
+    launch(gust_kernel(SCALARS[x.dtype]), size, x.device, radius, tuple(box), lanes, *arrays)
     return moved, hit.view(torch.bool)

@@ -18,8 +18,7 @@ from torch import Tensor
 
 from npa_envs.checks import as_list, check_alike, check_world, checked_number
 from npa_envs.errors import NPAError, shown
-from npa_envs.ops.brush_sums import blow, brush_sums
-from npa_envs.ops.random_numbers import draw
+from npa_envs.ops.brush_sums import brush_sums, gusts
 from npa_envs.ops.world_mean import world_mean
 from npa_envs.world.randomness import WorldRandom
 
@@ -94,25 +93,16 @@ def sums_under_brushes(
     return sums.view(*centres.shape[:2], -1)
 
 
-def gusts_and_blights(
-    x: Tensor,
-    random: WorldRandom,
-    *,
-    length: float,
-    chances: tuple[float, float],
-    radii: tuple[float, float],
-    box: Sides = None,
+def blow(
+    x: Tensor, random: WorldRandom, move: Tensor, hit: Tensor, *, gust_radius: float, box: Sides
 ) -> tuple[Tensor, Tensor]:
-    """Return positions after random gusts, [B, N, 2], and which particles blights hit, bool [B, N].
+    """Return x, [B, N, 2], with random particles pushed by `move`, [B, 2]; which are hit, [B, N].
 
-    Without gradient, by two draws of `random` and a launch. `length`: how far a gust moves what is
-    in its centre [length units]; `chances` and `radii` [length units] are the gust's, the blight's.
+    Hit are those within `hit`, [B], of a random particle [length units]. Without gradient; the
+    particles are the third and fourth draw of the streams in this step.
     """
     streams = [random.keys, random.episodes, random.steps]
-    angle = 2.0 * math.pi * draw(*streams, 1, "uniform", 1, x.dtype, 0)
-    moves = length * torch.cat((angle.cos(), angle.sin()), dim=1)
-    sides = [*(box or (0.0, 0.0))]
-    return blow(x.contiguous(), streams, moves, [*chances], [*radii], sides)
+    return gusts(x.contiguous(), streams, move, hit, gust_radius, [*(box or (0.0, 0.0))])
 
 
 def push(

@@ -66,7 +66,9 @@ def test_brushes_do_what_the_documentation_says():
     assert torch.allclose(rate[0, :, 0], 1.0 - held)
 
 
-@pytest.mark.parametrize("fields", [{}, {"boundary": "periodic", "box_size": 1.5}], ids=["open", "box"])
+@pytest.mark.parametrize(
+    "fields", [{}, {"boundary": "periodic", "box_size": 1.5}], ids=["open", "box"]
+)
 def test_gusts_and_blights_are_the_same_with_a_gradient(fields):
     fields |= {"gust_chance": 0.6, "gust_radius": 0.8, "blight_radius": 0.6}
     task, count = make(GARDENER, **fields).unwrapped.task, 32

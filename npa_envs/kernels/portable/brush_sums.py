@@ -1,5 +1,5 @@
 """Sums over the points under brushes, which hold points by (1 - r²)² at r radii from their centre;
-and gusts, which move particles as a brush does, with blights, which hit those in a ball.
+and gusts, which move particles as a brush does, before others are hit.
 
 Arguments: see `kernels/portable/__init__.py`.
 """
@@ -13,7 +13,7 @@ from npa_envs.kernels import native_functions as native
 from npa_envs.kernels.domain import scalar_name
 from npa_envs.kernels.lanes_and_memory import wait_for_previous_kernel
 from npa_envs.kernels.native_functions import WORLDS, in_ranges
-from npa_envs.kernels.portable.random_numbers import ULP_24, joined, world_words
+from npa_envs.kernels.portable.random_numbers import joined, world_words
 
 
 @cached_under_lock()
@@ -90,7 +90,7 @@ def brush_kernel(scalar: type, width: int, moments: bool) -> wp.Kernel:
 
 @cached_under_lock()
 def gust_kernel(scalar: type) -> wp.Kernel:
-    """Return the kernel of gusts and blights in 2D; `lanes` threads share a world."""
+    """Return the kernel of gusts in 2D; `lanes` threads share a world."""
     vector = wp.types.vector(2, scalar)
     brush = brush_functions(scalar)
 
@@ -106,42 +106,35 @@ def gust_kernel(scalar: type) -> wp.Kernel:
     @wp.kernel(module=native.module(f"npa_envs.kernels.gusts_{scalar_name(scalar)}"))
     def blow(
         range_start: int,
-        chances: vector,
-        radii: vector,
+        radius: scalar,
         box: vector,
         lanes: int,
         keys: wp.array[wp.int64],
         episodes: wp.array[wp.int32],
         steps: wp.array[wp.int32],
         moves: wp.array[vector],
+        hits: wp.array[scalar],
         positions: wp.array2d[vector],
         # outputs
         moved: wp.array2d[vector],
         hit: wp.array2d[wp.uint8],
     ):
-        """Write positions after gusts by `moves`, then which particles blights hit."""
+        """Write positions after gusts by `moves`, then what is within `hits` of a particle."""
         wait_for_previous_kernel()
         world, lane = wp.tid()
         world += range_start
         count = positions.shape[1]
-        # Draw 0 has the chances, 2 and 3 the particles in the middle; 1 is the direction.
-        drawn = world_words(world, 0, 0, keys, episodes, steps)
-        move = moves[world]
-        if scalar(wp.float32(drawn[0] >> wp.uint32(8)) * ULP_24) >= chances[0]:
-            move *= scalar(0.0)
-        radius = scalar(-1.0)
-        if scalar(wp.float32(drawn[1] >> wp.uint32(8)) * ULP_24) < chances[1]:
-            radius = radii[1]
-        inverse = scalar(1.0) / radii[0]
-        drawn = world_words(world, 0, 2, keys, episodes, steps)
-        gust = positions[world, wp.int32(joined(drawn[0], drawn[1]) % wp.uint64(count))]
-        drawn = world_words(world, 0, 3, keys, episodes, steps)
-        blight = positions[world, wp.int32(joined(drawn[0], drawn[1]) % wp.uint64(count))]
-        blight = gusted(blight, gust, move, inverse, box)
+        inverse = scalar(1.0) / radius
+        # In a step these are the draws 2 and 3.
+        words = world_words(world, 0, 2, keys, episodes, steps)
+        gust = positions[world, wp.int32(joined(words[0], words[1]) % wp.uint64(count))]
+        words = world_words(world, 0, 3, keys, episodes, steps)
+        middle = positions[world, wp.int32(joined(words[0], words[1]) % wp.uint64(count))]
+        middle = gusted(middle, gust, moves[world], inverse, box)
         for i in range(lane, count, lanes):
-            position = gusted(positions[world, i], gust, move, inverse, box)
+            position = gusted(positions[world, i], gust, moves[world], inverse, box)
             moved[world, i] = position
-            away = brush.nearest_image(position - blight, box)
-            hit[world, i] = wp.uint8(wp.where(wp.length(away) <= radius, 1, 0))
+            away = brush.nearest_image(position - middle, box)
+            hit[world, i] = wp.uint8(wp.where(wp.length(away) <= hits[world], 1, 0))
 
     return blow
