@@ -42,7 +42,7 @@ def best_methods() -> dict[str, tuple[Problem, str]]:
     best: dict[str, tuple[Problem, str]] = {}
     for suite in SUITES.values():
         rows = read_rows(suite, ROWS / plain_name(suite))
-        for env_id in suite.budgets.keys() - best.keys():
+        for env_id in [name for name in suite.budgets if name not in best]:
             returns = {name: rows[name].returns(env_id) for name in METHODS}
             means = {name: float(found.mean()) for name, found in returns.items() if len(found)}
             best[env_id] = suite.problem_of(task_name(env_id)), max(means, key=means.__getitem__)
@@ -75,7 +75,10 @@ def main(folders: list[Path]) -> None:
             films.append(episode(problem, GradientGardener))
         else:
             parts = "particle-steps", name, method, "seed-0"
-            run = next(run for f in folders if (run := f.joinpath(*parts)).is_dir())
+            run = next((run for f in folders if (run := f.joinpath(*parts)).is_dir()), None)
+            if run is None:
+                print(f"left out: {name}, of which there is no run by {method}")
+                continue
             policy = RuleSet.load(run, problem).policy()
             films.append(episode(problem, lambda envs, policy=policy: policy))
         captions.append(f"{name.removesuffix('-v0').removesuffix('Small')}: {method}")
