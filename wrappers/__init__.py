@@ -18,7 +18,6 @@ if TYPE_CHECKING:
     from npa_envs.wrappers.normalize import TorchNormalizeObservation as TorchNormalizeObservation
     from npa_envs.wrappers.normalize import TorchNormalizeReward as TorchNormalizeReward
     from npa_envs.wrappers.normalize import VectorNormalizePerception as VectorNormalizePerception
-    from npa_envs.wrappers.numeric_infos import NumericInfos as NumericInfos
     from npa_envs.wrappers.rsl_rl import RslRlParticleEnv as RslRlParticleEnv
     from npa_envs.wrappers.sb3 import ParticleVecEnv as ParticleVecEnv
     from npa_envs.wrappers.sb3 import RowPolicy as RowPolicy
@@ -31,7 +30,6 @@ if TYPE_CHECKING:
 # Not in `__all__`, as a star import must not need optional libraries.
 ON_REQUEST = {
     "NPATorchRLEnv": "torchrl",
-    "NumericInfos": "numeric_infos",
     "ParticleVecEnv": "sb3",
     "RowPolicy": "sb3",
     "RslRlParticleEnv": "rsl_rl",

@@ -151,6 +151,7 @@ class RuleWorld(LiveWorld):
         frame = self.task.frame
         return super().describe() | {
             "title": self.main.name,
+            "note": f"class {int(self._goal)}" if self.task.classifies else "",
             "dimension": self.main.rule.space_dim,
             "half_width": frame.half_width,
             "centre": list(frame.centre),

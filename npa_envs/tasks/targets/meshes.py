@@ -4,17 +4,18 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from PIL import Image
 
 from npa_envs.atomic_files import home_path
 from npa_envs.errors import NPAError, shown, suggest
-from npa_envs.ops import Cameras
-from npa_envs.ops.pictures.triangles import WRAP_NUMBERS, TexturedFaces, nearest_triangles
+
+if TYPE_CHECKING:
+    from npa_envs.ops import Cameras
+    from npa_envs.ops.pictures.triangles import TexturedFaces
 
 FloatArray = NDArray[np.float64]
 
@@ -158,6 +159,10 @@ def _textured_faces(mesh: Mesh, light: FloatArray) -> TexturedFaces | None:
     """Return a mesh's textures with all their levels; `light`: brightness of each corner."""
     if mesh.texture_of_face is None or mesh.uv is None or (mesh.texture_of_face < 0).all():
         return None
+    import torch
+
+    from npa_envs.ops.pictures.triangles import WRAP_NUMBERS, TexturedFaces
+
     limit = min(MAX_TEXELS, MAX_ALL_TEXELS // len(mesh.textures))
     texels: list[NDArray[np.uint8]] = []
     headers: list[list[tuple[int, int, int]]] = []
@@ -193,6 +198,11 @@ def draw_mesh(mesh: Mesh, cameras: Cameras) -> NDArray[np.float32]:
     averaged in linear light. Both sides of triangles are visible. Triangles with a vertex nearer
     than `cameras.near` are left out. The top row is first.
     """
+    # Reading a mesh needs neither, and their imports take seconds.
+    import torch
+
+    from npa_envs.ops.pictures.triangles import nearest_triangles
+
     light = np.asarray(LIGHT) / np.linalg.norm(LIGHT)
     lit = AMBIENT + (1.0 - AMBIENT) * (mesh.normals() @ light).clip(0.0, 1.0)
     light = lit[mesh.faces]
