@@ -30,25 +30,19 @@ if TYPE_CHECKING:
 # Not in `__all__`, as a star import must not need optional libraries.
 ON_REQUEST = {
     "NPATorchRLEnv": "torchrl",
-    "ParticleVecEnv": "sb3",
-    "RowPolicy": "sb3",
     "RslRlParticleEnv": "rsl_rl",
-    "SpeciesVecEnv": "sb3",
-    "WorldVecEnv": "sb3",
+    **dict.fromkeys(("ParticleVecEnv", "RowPolicy", "SpeciesVecEnv", "WorldVecEnv"), "sb3"),
 }
-MODULES = {
-    "DamageEvents": "damage",
-    "NormalizePerception": "normalize",
-    "ParticleRows": "base",
-    "SpeciesTags": "species_tags",
-    "TorchNormalizeObservation": "normalize",
-    "TorchNormalizeReward": "normalize",
-    "TorchRecordEpisodeStatistics": "episode_statistics",
-    "VectorDamageEvents": "damage",
-    "VectorNormalizePerception": "normalize",
-    "VectorSpeciesTags": "species_tags",
+_PUBLIC_NAMES = {
+    "base": "ParticleRows",
+    "damage": "DamageEvents VectorDamageEvents",
+    "episode_statistics": "TorchRecordEpisodeStatistics",
+    "normalize": "NormalizePerception TorchNormalizeObservation TorchNormalizeReward "
+    "VectorNormalizePerception",
+    "species_tags": "SpeciesTags VectorSpeciesTags",
 }
-__all__ = [*MODULES]
+MODULES = {name: module for module, names in _PUBLIC_NAMES.items() for name in names.split()}
+__all__ = sorted(MODULES)
 
 
 def __getattr__(name: str) -> Any:

@@ -18,7 +18,7 @@ import tyro
 from npa_envs.cli import INTERRUPTED, common
 from npa_envs.cli.final_report import write_report
 from npa_envs.errors import NPAError, shown
-from npa_envs.parent_process import end_with_parent
+from npa_envs.measure.process_queue import end_with_parent
 from npa_envs.tasks.co_morphogenesis2d import CoMorphogenesis2DConfig
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2DConfig
 from npa_envs.tasks.train_config import COMMON, UNLISTED, Common

@@ -18,7 +18,7 @@ import torch
 import torch.distributed as dist
 
 from npa_envs.errors import LostProcessError, NPAError, shown
-from npa_envs.parent_process import LOST_CODE
+from npa_envs.measure.process_queue import LOST_CODE
 from npa_envs.training.process_group import ProcessGroup
 from npa_envs.training.run_folder import RunFolder
 

@@ -15,7 +15,7 @@ from pathlib import Path
 from PIL import Image
 
 from npa_envs.errors import NPAError, shown
-from npa_envs.parent_process import end_with_parent
+from npa_envs.measure.process_queue import end_with_parent
 from npa_envs.tasks.targets.images import (
     is_emoji,
     looks_like_path,

@@ -19,8 +19,8 @@ from torch import Tensor
 
 from npa_envs.atomic_files import made_folder, read_json, write_bytes
 from npa_envs.errors import NPAError
+from npa_envs.measure.process_queue import PARENT_GRACE, PARENT_PIPE
 from npa_envs.measure.quality import psnr
-from npa_envs.parent_process import PARENT_GRACE, PARENT_PIPE
 from npa_envs.render import to_uint8
 from npa_envs.tasks.base import Task
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2D

@@ -36,7 +36,6 @@ LAYERS = {
     "npa_envs.checks": Layer(1, "torch"),
     "npa_envs.atomic_files": Layer(1),
     "npa_envs.compile_lock": Layer(0),
-    "npa_envs.parent_process": Layer(0),
     "npa_envs.runtime": Layer(1, "warp"),
     "npa_envs.reference": Layer(1, "torch"),
     "npa_envs.kernels": Layer(1, "warp"),

@@ -16,15 +16,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import (
-    Image,
-    ImageDraw,
-    ImageFile,
-    ImageFont,
-    ImageOps,
-    UnidentifiedImageError,
-    features,
-)
+from PIL import Image, ImageDraw, ImageFile, ImageFont, ImageOps, UnidentifiedImageError, features
 
 from npa_envs.atomic_files import read_bytes
 from npa_envs.errors import MissingDependencyError, NPAError, importing, shown
