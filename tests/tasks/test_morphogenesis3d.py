@@ -14,8 +14,16 @@ from npa_envs.render import turntable_frames, write_gaussians, write_points, wri
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.gaussian_outputs import HARMONIC_0, OUTPUTS, appearance
 from npa_envs.tasks.morphogenesis3d import Morphogenesis3D, Morphogenesis3DConfig
-from npa_envs.tasks.targets.meshes import AMBIENT, LIGHT, load_mesh
-from npa_envs.tasks.targets.views import ANGLE, DISTANCE, composited, load_views, some_views
+from npa_envs.tasks.targets.meshes import load_mesh
+from npa_envs.tasks.targets.views import (
+    AMBIENT,
+    ANGLE,
+    DISTANCE,
+    LIGHT,
+    composited,
+    load_views,
+    some_views,
+)
 from npa_envs.world.particles import Particles
 
 WORLD = {"target": "doughnut", "particle_count": 150, "eps": 0.3, "sigma": 0.1, "opacity": 0.5}

@@ -11,9 +11,9 @@ from npa_envs.errors import NPAError
 from npa_envs.render.point_files import write_gaussians
 from npa_envs.tasks.gaussian_outputs import Gaussians
 from npa_envs.tasks.targets import meshes
-from npa_envs.tasks.targets.meshes import RADIUS, draw_mesh, load_mesh
+from npa_envs.tasks.targets.meshes import RADIUS, load_mesh
 from npa_envs.tasks.targets.splat_files import colours_from, ply_kind, read_splats
-from npa_envs.tasks.targets.views import composited, load_views
+from npa_envs.tasks.targets.views import composited, draw_mesh, load_views
 
 
 def write_ply(path, columns, *, faces=0):
