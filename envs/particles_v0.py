@@ -83,7 +83,15 @@ class ParticlesEnv(CrowdEnv):
 
     ## Info
 
-    As for [several species](MultiSpecies.md#info), of the particle and of the terms above.
+    As for [several species](MultiSpecies.md#info), of the particle.
+
+    | Key | Value |
+    |---|---|
+    | `species` | the particle's species, from 0 on |
+    | `loss` | its current loss |
+    | `loss_separation`, ... | the same by the name of its term, see above |
+    | `reward_separation`, ... | its decrease in this step |
+    | `reason` | why the particle's episode ended; 0 before |
 
     ## Arguments
 

@@ -148,8 +148,11 @@ class Pictures2DEnv(NPAEnv):
 
     ## Info
 
-    As of [`npa/Morphogenesis2D-v0`](Morphogenesis2D.md#info); after resets and steps also `target`,
-    the index of the picture, whose name is in `env.unwrapped.task.names`.
+    | Key | In | Value |
+    |---|---|---|
+    | `loss_density`, `loss_colour` | reset, step | the terms of the loss |
+    | `reward_density`, `reward_colour` | step | decrease of each term in this step |
+    | `target` | reset, step | index of the picture; `env.unwrapped.task.names` has its name |
     """
 
     task_type = PicturesTask

@@ -278,8 +278,14 @@ class Shapeshifter2DEnv(NPAEnv):
 
     ## Info
 
-    As of [gardens](Gardener2D.md#info), with losses for the goal that was observed before the step;
-    after resets and steps also `goal`, the index of the goal's code.
+    | Key | In | Value |
+    |---|---|---|
+    | `goal` | reset, step | index of the goal's code |
+    | `loss` | reset, step | current loss L; of a step, for the goal observed before it |
+    | `loss_density`, `loss_colour` | reset, step | the terms of the loss |
+    | `reward_density`, `reward_colour` | step | decrease of each term, whatever the goals were |
+    | `success`, `diverged` | step | whether the world succeeded or diverged in it, bool |
+    | `reason` | last step | why the episode ended, see above; None for other worlds |
     """
 
     task_type = ShapeshifterTask

@@ -45,6 +45,11 @@ class TorchRecordEpisodeStatistics(RewardSums):
         self._began = np.full(env.num_envs, time.perf_counter())
 
     @property
+    def episode_returns(self) -> Tensor | None:
+        """Sum of the rewards of each running episode, float64, shape [B]."""
+        return self.sums
+
+    @property
     def return_queue(self) -> deque[float]:
         """Returns of the last episodes; reading them waits for the device."""
         returns = torch.cat(tuple(self._returns)).tolist() if self._returns else []

@@ -233,6 +233,11 @@ class TorchNormalizeReward(RewardSums):
         self.update_running_mean = True
         """Whether new rewards update the statistics."""
 
+    @property
+    def accumulated_reward(self) -> Tensor | None:
+        """Discounted return of each running episode, float64, shape [B]."""
+        return self.sums
+
     def use_sums(self, rewards: Tensor, sums: Tensor) -> tuple[Tensor, dict[str, Any]]:
         """Return rewards [B] divided by the standard deviation of returns, and no infos."""
         restarted = self.clock.restarted
