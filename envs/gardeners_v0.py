@@ -66,7 +66,8 @@ class GardenersEnv(KnownAgents):
 
     ## State
 
-    `state()` and `state_space` are as for [several species](MultiSpecies.md#state).
+    `state()` is for central critics: float32, shape [N, 2 + C + 1], a row [position; state; 1] for
+    each particle, as with [several species](MultiSpecies.md#state). `state_space` is its space.
 
     ## Reward
 
@@ -81,6 +82,10 @@ class GardenersEnv(KnownAgents):
 
     `max_cycles`, the steps of an episode, and all arguments of `npa/Gardener2D-v0`. Chances of
     gusts and blights are 0 by default.
+
+    ## Version history
+
+    - v0: first version.
     """
 
     metadata: ClassVar[dict[str, Any]] = {

@@ -155,6 +155,10 @@ class MultiSpeciesEnv(CrowdEnv):
     `task` and `species_count` are positional, all others are keywords of `parallel_env`, `env`,
     `raw_env` and `pettingzoo.make`. An unknown name, or a value out of range, raises an `NPAError`
     that says which values are valid.
+
+    ## Version history
+
+    - v0: first version.
     """
 
     def __init__(self, task: str = "mixing", **config: Any) -> None:
