@@ -10,7 +10,7 @@ import unicodedata
 from PIL import Image
 
 from npa_envs.errors import NPAError
-from npa_envs.tasks.targets.picture_points import render_emoji
+from npa_envs.tasks.targets.images import render_emoji
 
 BLOCKS = (
     (0x1F300, 0x1F5FF),

@@ -54,6 +54,7 @@ extensions = [
     "sphinx_copybutton",
 ]
 myst_heading_anchors = 4
+myst_enable_extensions = ["dollarmath"]
 nb_execution_mode = "off"
 copybutton_exclude = ".linenos, .gp, .go"
 

@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from npa_envs.rule.files import save_rule as save_rule
     from npa_envs.rule.files import shipped_rules as shipped_rules
     from npa_envs.rule.rule import NPARule as NPARule
+    from npa_envs.tasks.seeds import uniform_ball as uniform_ball
     from npa_envs.world.divergence import describe_divergence as describe_divergence
     from npa_envs.world.divergence import divergence as divergence
     from npa_envs.world.randomness import WorldRandom as WorldRandom
@@ -65,6 +66,7 @@ _PUBLIC_NAMES = {
     "species_fields world_mean",
     "rule.files": "load_rule save_rule shipped_rules",
     "rule.rule": "NPARule",
+    "tasks.seeds": "uniform_ball",
     "world.divergence": "describe_divergence divergence",
     "world.randomness": "WorldRandom",
     "world.rollout": "at_rest rollout step",

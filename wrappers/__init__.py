@@ -18,7 +18,6 @@ if TYPE_CHECKING:
     from npa_envs.wrappers.normalize import TorchNormalizeObservation as TorchNormalizeObservation
     from npa_envs.wrappers.normalize import TorchNormalizeReward as TorchNormalizeReward
     from npa_envs.wrappers.normalize import VectorNormalizePerception as VectorNormalizePerception
-    from npa_envs.wrappers.numeric_infos import NumericInfos as NumericInfos
     from npa_envs.wrappers.rsl_rl import RslRlParticleEnv as RslRlParticleEnv
     from npa_envs.wrappers.sb3 import ParticleVecEnv as ParticleVecEnv
     from npa_envs.wrappers.sb3 import RowPolicy as RowPolicy
@@ -31,26 +30,19 @@ if TYPE_CHECKING:
 # Not in `__all__`, as a star import must not need optional libraries.
 ON_REQUEST = {
     "NPATorchRLEnv": "torchrl",
-    "NumericInfos": "numeric_infos",
-    "ParticleVecEnv": "sb3",
-    "RowPolicy": "sb3",
     "RslRlParticleEnv": "rsl_rl",
-    "SpeciesVecEnv": "sb3",
-    "WorldVecEnv": "sb3",
+    **dict.fromkeys(("ParticleVecEnv", "RowPolicy", "SpeciesVecEnv", "WorldVecEnv"), "sb3"),
 }
-MODULES = {
-    "DamageEvents": "damage",
-    "NormalizePerception": "normalize",
-    "ParticleRows": "base",
-    "SpeciesTags": "species_tags",
-    "TorchNormalizeObservation": "normalize",
-    "TorchNormalizeReward": "normalize",
-    "TorchRecordEpisodeStatistics": "episode_statistics",
-    "VectorDamageEvents": "damage",
-    "VectorNormalizePerception": "normalize",
-    "VectorSpeciesTags": "species_tags",
+_PUBLIC_NAMES = {
+    "base": "ParticleRows",
+    "damage": "DamageEvents VectorDamageEvents",
+    "episode_statistics": "TorchRecordEpisodeStatistics",
+    "normalize": "NormalizePerception TorchNormalizeObservation TorchNormalizeReward "
+    "VectorNormalizePerception",
+    "species_tags": "SpeciesTags VectorSpeciesTags",
 }
-__all__ = [*MODULES]
+MODULES = {name: module for module, names in _PUBLIC_NAMES.items() for name in names.split()}
+__all__ = sorted(MODULES)
 
 
 def __getattr__(name: str) -> Any:

@@ -11,8 +11,8 @@ import torch
 
 from npa_envs.ops import orbit
 from npa_envs.render import to_uint8, write_filmstrip
-from npa_envs.tasks.targets.meshes import builtin_meshes, draw_mesh, load_mesh
-from npa_envs.tasks.targets.views import ANGLE, DISTANCE
+from npa_envs.tasks.targets.meshes import builtin_meshes, load_mesh
+from npa_envs.tasks.targets.views import ANGLE, DISTANCE, draw_mesh
 
 PICTURE = Path(__file__).resolve().parents[1] / "images" / "meshes.webp"
 RESOLUTION = 160

@@ -57,9 +57,15 @@ def main(arguments: Sequence[str]) -> int:
     from npa_envs.measure import quality
     from npa_envs.measure.benchmark_records import UNMEASURED, table_text, tables_json
     from npa_envs.rule.files import load_rule
+    from npa_envs.training.task_of_rule import trained_task_name
 
     quality.check_steps("checkpoints", options.checkpoints or quality.CHECKPOINTS)
     common.check_numbers(options, seed_count=1)
+    if options.judge and (task := trained_task_name(options.rule)) != "texture":
+        raise NPAError(
+            f"judge compares textures, got {shown(options.rule)} of the task {task}: leave out "
+            "--judge, or give a rule of the task texture"
+        )
     device = options.checked_device()
     rule = load_rule(options.rule, device=device).float()
     seeds = range(quality.FIRST_SEED, quality.FIRST_SEED + options.seed_count)
@@ -82,9 +88,9 @@ def _measure_pictures(options: EvaluateOptions, rule: NPARule, **worlds: Any) ->
     from npa_envs.training.task_of_rule import tasks_of_codes
 
     assert rule.codes is not None
-    if options.healing or options.judge:
+    if options.healing:
         raise NPAError(
-            "healing and judge are measured of one picture at a time, of the rule's "
+            "healing is measured of one picture at a time, of the rule's "
             f"{len(rule.codes)}: give --target {shown(rule.codes.names[0])}"
         )
     tasks = tasks_of_codes(options.rule, rule, worlds["device"], **options.world)

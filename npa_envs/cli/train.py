@@ -18,6 +18,7 @@ import tyro
 from npa_envs.cli import INTERRUPTED, common
 from npa_envs.cli.final_report import write_report
 from npa_envs.errors import NPAError, shown
+from npa_envs.measure.process_queue import end_with_parent
 from npa_envs.tasks.co_morphogenesis2d import CoMorphogenesis2DConfig
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2DConfig
 from npa_envs.tasks.train_config import COMMON, UNLISTED, Common
@@ -37,7 +38,6 @@ from npa_envs.training import (
 from npa_envs.training.checkpoint import check_task, has_per_world_streams, load_checkpoint
 from npa_envs.training.process_group import ProcessGroup
 from npa_envs.training.process_launcher import (
-    end_with_parent,
     joined_processes,
     launch,
     print_once,

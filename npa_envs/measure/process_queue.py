@@ -1,12 +1,14 @@
 """A queue of child processes, which run on several devices; signals end all of them.
 
-Machines that share a disk can divide the same runs among them (`part_of`), each with its own queue.
+Other children end with the process that started them (`end_with_parent`). Machines that share a
+disk can divide the same runs among them (`part_of`), each with its own queue.
 """
 
 from __future__ import annotations
 
 import contextlib
 import math
+import os
 import signal
 import sys
 import threading
@@ -186,3 +188,33 @@ def part_of(
     groups = list(dict.fromkeys(map(group_of, items)))
     mine = set(groups[int(number) - 1 :: int(count)])
     return [item for item in items if group_of(item) in mine]
+
+
+PARENT_PIPE = "NPA_ENVS_PARENT_PIPE"
+"""The environment variable by which a parent says that it holds the other end of the input."""
+
+PARENT_GRACE = 10.0
+"""Time in which a process saves and ends after its parent has gone [s]."""
+
+LOST_CODE = 2
+"""Exit code of a process that has lost another one, that of errors on the command line."""
+
+
+def end_with_parent() -> None:
+    """Let this process end soon after its parent, where `PARENT_PIPE` is in the environment.
+
+    Such a parent starts it with a pipe as standard input, and never writes. When it closes the
+    pipe or ends, also by SIGKILL, this process gets SIGTERM, on which a run saves, and is ended
+    after `PARENT_GRACE`. The processes of torch's launcher inherit pipe and variable.
+    """
+    if PARENT_PIPE not in os.environ:
+        return
+
+    def watch() -> None:
+        while os.read(0, 1):
+            pass
+        os.kill(os.getpid(), signal.SIGTERM)
+        time.sleep(PARENT_GRACE)
+        os._exit(LOST_CODE)
+
+    threading.Thread(target=watch, name="npa-envs parent", daemon=True).start()

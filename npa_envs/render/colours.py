@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
+from collections.abc import Sequence
 
 import numpy as np
 import torch
@@ -103,15 +104,8 @@ _LAB_FROM_ROOTS = (
     (1.9779984951, -2.4285922050, 0.4505937099),
     (0.0259040371, 0.7827717662, -0.8086757660),
 )
-_ROOTS_FROM_LAB = (
-    (1.0, 0.3963377774, 0.2158037573),
-    (1.0, -0.1055613458, -0.0638541728),
-    (1.0, -0.0894841775, -1.2914855480),
-)
-_RGB_FROM_LMS = (
-    (4.0767416621, -3.3077115913, 0.2309699292),
-    (-1.2684380046, 2.6097574011, -0.3413193965),
-    (-0.0041960863, -0.7034186147, 1.7076147010),
+_ROOTS_FROM_LAB, _RGB_FROM_LMS = (
+    np.linalg.inv(matrix).tolist() for matrix in (_LAB_FROM_ROOTS, _LMS_FROM_RGB)
 )
 
 
@@ -173,6 +167,6 @@ def srgb(lab: Tensor) -> Tensor:
     return torch.where(linear <= 0.0031308, 12.92 * linear, curved)
 
 
-def _mix(channels: Tensor, matrix: tuple[tuple[float, float, float], ...]) -> Tensor:
+def _mix(channels: Tensor, matrix: Sequence[Sequence[float]]) -> Tensor:
     red, green, blue = channels.unbind(-1)
     return torch.stack([r * red + g * green + b * blue for r, g, b in matrix], dim=-1)

@@ -9,7 +9,6 @@ import os
 import signal
 import sys
 import threading
-import time
 import uuid
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -19,38 +18,12 @@ import torch
 import torch.distributed as dist
 
 from npa_envs.errors import LostProcessError, NPAError, shown
+from npa_envs.measure.process_queue import LOST_CODE
 from npa_envs.training.process_group import ProcessGroup
 from npa_envs.training.run_folder import RunFolder
 
 if TYPE_CHECKING:
     from torch.distributed.elastic.multiprocessing.errors import ProcessFailure
-
-
-PARENT_PIPE = "NPA_ENVS_PARENT_PIPE"
-"""The environment variable by which a parent says that it holds the other end of the input."""
-
-PARENT_GRACE = 10.0
-"""Time in which a process saves and ends after its parent has gone [s]."""
-
-
-def end_with_parent() -> None:
-    """Let this process end soon after its parent, where `PARENT_PIPE` is in the environment.
-
-    Such a parent starts it with a pipe as standard input, and never writes. When it closes the
-    pipe or ends, also by SIGKILL, this process gets SIGTERM, on which a run saves, and is ended
-    after `PARENT_GRACE`. The processes of torch's launcher inherit pipe and variable.
-    """
-    if PARENT_PIPE not in os.environ:
-        return
-
-    def watch() -> None:
-        while os.read(0, 1):
-            pass
-        os.kill(os.getpid(), signal.SIGTERM)
-        time.sleep(PARENT_GRACE)
-        os._exit(LOST_CODE)
-
-    threading.Thread(target=watch, name="npa-envs parent", daemon=True).start()
 
 
 def launch(count: int, arguments: Sequence[str], out: Path, device: str) -> int:
@@ -209,9 +182,6 @@ BEAT_SECONDS = 5.0
 
 SILENT_BEATS = 8
 """Number of missed heartbeats after which a process is lost."""
-
-LOST_CODE = 2
-"""Exit code of a process that has lost another one, that of errors on the command line."""
 
 _FINISHED = -(2**62)
 

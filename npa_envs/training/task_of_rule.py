@@ -99,6 +99,11 @@ def task_of_rule(
     return TrainedTask(task, why_not_measurable, task_name)
 
 
+def trained_task_name(source: str) -> str:
+    """Return the name of the task that a rule, named as for `load_rule`, was trained on."""
+    return _file_of(source)[1].get("task", "morphogenesis2d")
+
+
 def _file_of(source: str) -> tuple[Path, Mapping[str, str]]:
     path = rule_file(source)
     return path, rule_metadata(path) if path.suffix == ".safetensors" else {}

@@ -1,7 +1,8 @@
 """Reads a file that was dropped on a page, in a process of its own with limits.
 
 `python -m npa_envs.web.dropped_file FILE [whole]` writes what is to grow of a picture or an emoji
-as picture.png beside it, or checks a mesh. It prints what the readers print, or the error.
+as picture.png beside it, or checks a mesh. It prints what the readers print, or the error. It
+imports torch, which takes seconds, for point clouds alone: files are refused at once.
 """
 
 from __future__ import annotations
@@ -14,11 +15,17 @@ from pathlib import Path
 from PIL import Image
 
 from npa_envs.errors import NPAError, shown
-from npa_envs.tasks.targets.images import looks_like_path, read_image, with_background
-from npa_envs.tasks.targets.meshes import MESH_SUFFIXES, load_mesh
-from npa_envs.tasks.targets.picture_points import is_emoji, render_emoji, target_from_image
-from npa_envs.tasks.targets.splat_files import ply_kind, read_splats
-from npa_envs.training.process_launcher import end_with_parent
+from npa_envs.measure.process_queue import end_with_parent
+from npa_envs.tasks.targets.images import (
+    is_emoji,
+    looks_like_path,
+    read_image,
+    render_emoji,
+    resample,
+    with_background,
+)
+from npa_envs.tasks.targets.mesh_files import read_mesh
+from npa_envs.tasks.targets.meshes import MESH_SUFFIXES
 
 MAX_BYTES = 64 * 2**20
 """Maximum size of a dropped file [bytes]."""
@@ -55,8 +62,7 @@ def read_dropped(path: Path, *, whole: bool = False) -> None:
     as `PICTURE` to the file's folder. With `whole` a picture keeps its background.
     """
     if path.suffix in MESH_SUFFIXES:
-        is_surface = path.suffix != ".ply" or ply_kind(path) == "triangles"
-        count = len(load_mesh(path).faces if is_surface else read_splats(path).means)
+        count = _element_count(path)
         if count > MAX_TRIANGLES:
             raise NPAError(
                 f"a dropped 3D file must have at most {MAX_TRIANGLES} triangles or points, got "
@@ -76,8 +82,22 @@ def read_dropped(path: Path, *, whole: bool = False) -> None:
         image = with_background(image) if whole else image
     image.thumbnail((MAX_SIDE, MAX_SIDE), Image.Resampling.LANCZOS)
     # Raises if the picture is too thin to be sampled.
-    target_from_image(image, name=str(path), point_count=512)
+    resample(image, 512, label=str(path))
     image.save(path.with_name(PICTURE))
+
+
+def _is_ply(path: Path) -> bool:
+    return path.suffix == ".ply" and path.read_bytes()[:3] == b"ply"
+
+
+def _element_count(path: Path) -> int:
+    """Return the number of triangles, points or Gaussians in a file."""
+    if _is_ply(path):
+        from npa_envs.tasks.targets.splat_files import ply_kind, read_splats
+
+        if ply_kind(path) != "triangles":
+            return len(read_splats(path).means)
+    return len(read_mesh(path).faces)
 
 
 def limit_resources() -> None:
@@ -95,9 +115,13 @@ def limit_resources() -> None:
 def main(arguments: Sequence[str]) -> int:
     """Read a file within the limits; return 0, or 2 after an error that is printed."""
     end_with_parent()
+    path = Path(arguments[0])
+    if _is_ply(path):
+        # First, as the memory of torch is not counted.
+        import npa_envs.tasks.targets.splat_files  # noqa: F401
     limit_resources()
     try:
-        read_dropped(Path(arguments[0]), whole="whole" in arguments[1:])
+        read_dropped(path, whole="whole" in arguments[1:])
     except (NPAError, MemoryError) as error:
         message = str(error) or f"reading it takes more than {MEMORY >> 30} GiB: reduce it"
         print(f"npa-envs: error: {' '.join(message.split())}")

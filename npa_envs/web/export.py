@@ -173,7 +173,7 @@ def page_rule(source: str, *, particle_count: int | None = None) -> dict[str, An
             f"a {type(task).__name__}: watch it with npa-envs view"
         )
     # rule_world.js adds these itself.
-    added = ("type", "rules", "rule", "others", "species", "show", "playing", "seed")
+    added = ("type", "rules", "rule", "others", "species", "show", "playing", "seed", "note")
     world = {name: value for name, value in live.describe().items() if name not in added}
     classes = {"palette": PALETTE, "undecided": UNDECIDED}
     return {

@@ -83,6 +83,7 @@ class TrainingEvent(TypedDict, total=False):
     name: str  # Name of the file for the user, or the emoji.
     folder: str  # Path of the run's folder.
     note: str  # What was read, or "".
+    picture: str  # Name of the picture that is learned, a file to download.
     message: str  # Why it has failed.
     cure: Literal["whole"]  # Upload again with this keyword, which keeps the background.
     has_rule: bool  # Whether there is a rule to show and download.

@@ -148,9 +148,10 @@ class RuleWorld(LiveWorld):
 
     def describe(self) -> WorldEvent:
         """Return the event "world", all its fields."""
-        frame = self.task.frame
+        frame, goal = self.task.frame, self._goal if self.task.classifies else None
         return super().describe() | {
             "title": self.main.name,
+            "note": "" if goal is None else f"class {int(goal)}",
             "dimension": self.main.rule.space_dim,
             "half_width": frame.half_width,
             "centre": list(frame.centre),

@@ -216,7 +216,8 @@ def training_routes(training: Training) -> list[Route]:
             return PlainTextResponse(str(error), 400)
         if path is None:
             return PlainTextResponse("no such file", 404)
-        return FileResponse(path, media_type="application/octet-stream", filename=path.name)
+        kind = "image/png" if path.suffix == ".png" else "application/octet-stream"
+        return FileResponse(path, media_type=kind, filename=path.name)
 
     return [
         Route("/training", upload, methods=["POST"]),

@@ -19,12 +19,12 @@ from torch import Tensor
 
 from npa_envs.atomic_files import made_folder, read_json, write_bytes
 from npa_envs.errors import NPAError
+from npa_envs.measure.process_queue import PARENT_GRACE, PARENT_PIPE
 from npa_envs.measure.quality import psnr
 from npa_envs.render import to_uint8
 from npa_envs.tasks.base import Task
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2D
 from npa_envs.tasks.morphogenesis3d import Morphogenesis3D
-from npa_envs.training.process_launcher import PARENT_GRACE, PARENT_PIPE
 from npa_envs.training.run_folder import JsonlLog, RunFolder
 from npa_envs.training.task_table import task_entry
 from npa_envs.web.dropped_file import EMOJI, MAX_BYTES, PICTURE, READ_SECONDS, stored_name
@@ -112,13 +112,17 @@ class Training:
             self._thread.join(2.0 * PARENT_GRACE)
 
     def file(self, run_id: str, name: str) -> Path | None:
-        """Return a file of the latest run to download: its rule, or its page, which is made now.
+        """Return a file of the latest run: the picture it learns, its rule, or its page, made now.
 
-        None: there is no such run, or it has no rule yet. Raises NPAError if the rule cannot run
-        in a page.
+        None: there is no such run, or it has no such file yet. Raises NPAError if the rule cannot
+        run in a page.
         """
         report = self.report
-        if run_id != report.get("id") or not report.get("has_rule"):
+        if run_id != report.get("id"):
+            return None
+        if name == report.get("picture"):
+            return Path(report["folder"], name)
+        if not report.get("has_rule"):
             return None
         rule = RunFolder(Path(report["folder"])).rule
         if name != "page.html":
@@ -153,8 +157,9 @@ class Training:
         output = self._call(words, folder, "reading the file", seconds=READ_SECONDS)
         if self._stopping.is_set():
             return self._set(state="stopped")
-        self._set(state="starting", note=output.removeprefix(f"{stored.name}: ").strip())
         flat = (folder / PICTURE).exists()
+        note = output.removeprefix(f"{stored.name}: ").strip()
+        self._set(state="starting", note=note, **({"picture": PICTURE} if flat else {}))
         task = "morphogenesis2d" if flat else "morphogenesis3d"
         target = folder / PICTURE if flat else stored
         text = stored.read_text("utf-8") if stored.name == EMOJI else target
@@ -192,7 +197,7 @@ class Training:
         begun = time.monotonic()
         with path.open("wb") as file, subprocess.Popen(command, stdout=file, **options) as process:
             try:
-                while process.poll() is None and not self._stopping.wait(0.25):
+                while process.poll() is None and not self._stopping.wait(0.05 if seconds else 0.25):
                     if seconds is not None and time.monotonic() > begun + seconds:
                         raise NPAError(f"{what} must take at most {seconds} s: give a smaller file")
                     self._look(folder)

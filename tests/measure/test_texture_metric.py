@@ -119,4 +119,9 @@ def test_the_command_prints_ratios_and_writes_them(tmp_path, capsys):
         mean = (row["patches"] + row["spectra"] + row["colours"]) / 3.0
         assert row["ratio"] == pytest.approx(mean)
         assert row["ratio_worst"] == row["ratio"] > 3.0
+
+
+def test_a_judge_of_other_rules_is_refused_before_the_rule_is_loaded(monkeypatch, capsys):
+    monkeypatch.setattr("npa_envs.rule.files.load_rule", lambda *_, **__: pytest.fail("it loads"))
     assert main(["evaluate", "digits", "--judge"]) == 2
+    assert "of the task point_classification: leave out --judge" in capsys.readouterr().err

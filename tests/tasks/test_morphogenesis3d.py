@@ -14,7 +14,8 @@ from npa_envs.render import turntable_frames, write_gaussians, write_points, wri
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.gaussian_outputs import HARMONIC_0, OUTPUTS, appearance
 from npa_envs.tasks.morphogenesis3d import Morphogenesis3D, Morphogenesis3DConfig
-from npa_envs.tasks.targets.meshes import AMBIENT, LIGHT, load_mesh
+from npa_envs.tasks.targets import views
+from npa_envs.tasks.targets.meshes import load_mesh
 from npa_envs.tasks.targets.views import ANGLE, DISTANCE, composited, load_views, some_views
 from npa_envs.world.particles import Particles
 
@@ -89,8 +90,9 @@ def under_the_surface(count, depth):
     u, v = np.where(u + v > 1, 1 - u, u), np.where(u + v > 1, 1 - v, v)
     x = a[chosen] + u * (b - a)[chosen] + v * (c - a)[chosen]
     x -= depth * (outward / area)[chosen]
-    light = (mesh.normals() @ (np.array(LIGHT) / np.linalg.norm(LIGHT))).clip(0)
-    lit = mesh.colours[:, 0] * (AMBIENT + (1 - AMBIENT) * light[mesh.faces[:, 0]])[:, None]
+    light = (mesh.normals() @ (np.array(views.LIGHT) / np.linalg.norm(views.LIGHT))).clip(0)
+    shade = views.AMBIENT + (1 - views.AMBIENT) * light[mesh.faces[:, 0]]
+    lit = mesh.colours[:, 0] * shade[:, None]
     colours = lit[chosen]
     return [torch.tensor(t, dtype=torch.float32)[None] for t in (x, colours)]
 

@@ -10,10 +10,10 @@ from support import reference_gaussians
 from npa_envs.errors import NPAError
 from npa_envs.render.point_files import write_gaussians
 from npa_envs.tasks.gaussian_outputs import Gaussians
-from npa_envs.tasks.targets import meshes
-from npa_envs.tasks.targets.meshes import RADIUS, draw_mesh, load_mesh
+from npa_envs.tasks.targets import views
+from npa_envs.tasks.targets.meshes import RADIUS, load_mesh
 from npa_envs.tasks.targets.splat_files import colours_from, ply_kind, read_splats
-from npa_envs.tasks.targets.views import composited, load_views
+from npa_envs.tasks.targets.views import composited, draw_mesh, load_views
 
 
 def write_ply(path, columns, *, faces=0):
@@ -68,7 +68,7 @@ def test_views_of_a_point_cloud_are_those_of_its_surface(tmp_path, monkeypatch, 
     target = load_views(path, resolution=96, training_count=1, held_out_count=4)
     assert target.summary == "cloud.ply: 20001 points"
     # Points have the colours that they are seen in, without a light.
-    monkeypatch.setattr(meshes, "AMBIENT", 1.0)
+    monkeypatch.setattr(views, "AMBIENT", 1.0)
     expected = torch.from_numpy(draw_mesh(mesh, target.held_out.cameras))
     assert psnr(target.held_out.pictures, expected) > least
     colours, alpha = target.held_out.pictures.split((3, 1), dim=-1)

@@ -10,7 +10,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from npa_envs.errors import MissingDependencyError, NPAError
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2D, Morphogenesis2DConfig
-from npa_envs.tasks.targets import picture_points
+from npa_envs.tasks.targets import images
 from npa_envs.tasks.targets.images import read_image, resample
 from npa_envs.tasks.targets.notes import left_out
 from npa_envs.tasks.targets.picture_points import builtin_targets, load_target, target_from_image
@@ -198,9 +198,9 @@ def test_unreadable_picture_is_a_clear_error(tmp_path):
 
 def test_emoji_are_distinguished_from_words():
     for text in ("🦎", "❤", "❤️", "👩‍🚀", "🇨🇭", "1️⃣", "👍🏽", "☀"):
-        assert picture_points.is_emoji(text), text
+        assert images.is_emoji(text), text
     for text in ("", "gecko", "gëcko", "1", "守宫", "🦎" * 20):
-        assert not picture_points.is_emoji(text), text
+        assert not images.is_emoji(text), text
 
 
 @pytest.mark.parametrize(
@@ -211,13 +211,13 @@ def test_emoji_are_distinguished_from_words():
     ],
 )
 def test_emoji_that_no_font_draws_in_colour_are_clear_errors(monkeypatch, fonts, error, message):
-    monkeypatch.setattr(picture_points, "find_emoji_fonts", lambda: fonts)
+    monkeypatch.setattr(images, "find_emoji_fonts", lambda: fonts)
     with pytest.raises(error, match=message):
         load_target("☀")
 
 
 needs_emoji_font = pytest.mark.skipif(
-    not picture_points.find_emoji_fonts(), reason="no colour-emoji font is installed"
+    not images.find_emoji_fonts(), reason="no colour-emoji font is installed"
 )
 
 

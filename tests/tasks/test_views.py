@@ -13,20 +13,21 @@ from npa_envs.errors import NPAError
 from npa_envs.ops import orbit
 from npa_envs.tasks.losses.ms_ssim import MultiScaleSimilarity
 from npa_envs.tasks.morphogenesis3d import Morphogenesis3D, Morphogenesis3DConfig, blurred
-from npa_envs.tasks.targets import meshes
+from npa_envs.tasks.targets import views as views_module
 from npa_envs.tasks.targets.meshes import (
-    AMBIENT,
     RADIUS,
     Mesh,
     MeshTexture,
-    draw_mesh,
+    builtin_meshes,
     linear_light,
     load_mesh,
     srgb_values,
 )
 from npa_envs.tasks.targets.views import (
+    AMBIENT,
     ANGLE,
     DISTANCE,
+    draw_mesh,
     load_views,
     nearest_camera,
     surrounding_cameras,
@@ -39,7 +40,7 @@ def ball(radius=0.5, colour=(0.2, 0.6, 1.0)):
     return Mesh(np.array(sphere.vertices), np.array(sphere.faces), colours)
 
 
-@pytest.mark.parametrize("name", meshes.builtin_meshes())
+@pytest.mark.parametrize("name", builtin_meshes())
 def test_built_in_meshes_fit_the_ball_and_face_outward(name):
     mesh = load_mesh(name)
     assert np.linalg.norm(mesh.vertices, axis=1).max() == pytest.approx(RADIUS)
@@ -487,7 +488,7 @@ def test_large_textures_are_halved_and_look_alike(monkeypatch):
     cameras = orbit(1, 20.0, DISTANCE, ANGLE, width=48, height=48, azimuth=30.0)
     before = draw_mesh(mesh, cameras)
     # Two halvings: to 75 x 75.
-    monkeypatch.setattr(meshes, "MAX_TEXELS", 6000)
+    monkeypatch.setattr(views_module, "MAX_TEXELS", 6000)
     error = np.abs(draw_mesh(mesh, cameras) - before)
     assert 0.0 < error.mean() < 0.004
 

@@ -152,7 +152,7 @@ def test_all_that_a_page_shows_has_a_meaning(run):
         listen({ ...world, class_count: 11 });
         return element("meaning").textContent;
     """)
-    assert re.search("0 red, 1 green, .*, 9 black, 10 red; grey", classes)
+    assert re.search("0 red, 1 green, .*, 9 lavender, 10 red; grey", classes)
 
 
 def test_loading_is_shown_until_the_first_frame_and_the_key_f_shows_the_whole_world(run):

@@ -137,7 +137,12 @@ def test_only_the_servers_own_page_with_its_token_may_upload_and_download(held):
     assert not held.active
     mine = shared.post("/training", params={"token": site.token}, content=b"1")
     assert mine.status_code == 200
-    # Nothing is offered before there is a rule, and nothing but rule and page after.
+    picture = f"/training/{mine.json()['id']}/picture.png?token={site.token}"
+    (held._folder / mine.json()["id"] / "picture.png").write_bytes(png())
+    assert shared.get(picture).status_code == 404
+    held._set(picture="picture.png")
+    assert shared.get(picture).headers["content-type"] == "image/png"
+    # Nothing else is offered before there is a rule, and nothing but rule and page after.
     (held._folder / mine.json()["id"] / "rule.safetensors").write_bytes(b"rule")
     for path in ("rule.safetensors", "dropped", "..%2f..%2fsecret", "output.txt"):
         address = f"/training/{mine.json()['id']}/{path}?token={site.token}"
@@ -174,7 +179,7 @@ def test_an_opaque_photograph_is_refused_with_its_cure(tmp_path):
         ("dropped", png()[:-60], "truncated or damaged"),
         ("dropped", png(size=(8, 8)).replace(b"IHDR", b"IHDX"), "must be a picture|truncated"),
         ("emoji.txt", b"gecko", "one picture symbol, got 'gecko'"),
-        ("emoji.txt", b"\xff\xfe", "picture symbol|colour-emoji font|an installed font"),
+        ("emoji.txt", b"\xff\xfe", "picture symbol|colour-emoji font|an installed font|one emoji"),
         ("emoji.txt", "/\U0001f98a".encode(), "one picture symbol"),
         ("emoji.txt", b"", "one picture symbol"),
     ],
@@ -183,6 +188,19 @@ def test_what_cannot_be_learned_is_refused(tmp_path, name, content, error):
     (tmp_path / name).write_bytes(content)
     with pytest.raises(NPAError, match=error):
         read_dropped(tmp_path / name)
+
+
+def test_what_cannot_be_read_is_refused_without_the_slow_import_of_torch(tmp_path):
+    paths = [tmp_path / f"dropped{end}" for end in ("", ".glb", ".obj", ".ply")]
+    for path in (*paths, tmp_path / "emoji.txt"):
+        path.write_bytes(b"nothing of use")
+    code = (
+        "import sys; from npa_envs.web.dropped_file import main\n"
+        "print([main([path]) for path in sys.argv[1:]], {'torch', 'warp'} & {*sys.modules})"
+    )
+    command = [sys.executable, "-c", code, *map(str, paths), str(tmp_path / "emoji.txt")]
+    printed = subprocess.check_output(command, text=True)
+    assert printed.splitlines()[-1] == "[2, 2, 2, 2, 2] set()"
 
 
 def test_a_mesh_of_too_many_triangles_is_refused(tmp_path, monkeypatch):

@@ -9,16 +9,13 @@ from support.small_envs import begun
 
 from npa_envs.envs import gardeners_v0, multispecies_v0, particles_v0
 from npa_envs.registration import ALL, SPECIES_SIZES
-from npa_envs.wrappers import NumericInfos
 
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::UserWarning")
 DEATH = {"deaths": ((1, 3),), "max_cycles": 6}
 
 
-@pytest.mark.parametrize("wrapped", [False, True])
-def test_infos_are_numbers_and_have_the_same_entries_at_reset_and_in_every_step(wrapped):
+def test_infos_are_numbers_and_have_the_same_entries_at_reset_and_in_every_step():
     env = multispecies_v0.parallel_env(**small("co_morphogenesis", **DEATH))
-    env = NumericInfos(env) if wrapped else env
     _, first = env.reset(seed=0)
     terms = {f"{kind}_{part}" for kind in ("loss", "reward") for part in ("density", "colour")}
     names = {"species", "reason", "loss"} | terms

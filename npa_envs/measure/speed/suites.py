@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -279,11 +280,14 @@ def skip_rows(session: TimingSession) -> list[SkipRow]:
         return session.cost(run, generator=generator).time.divided(rolled.steps)
 
     def row(left_out: str, condition: str, *options: dict[str, Any]) -> SkipRow:
-        done, skipped = map(cost, options)
-        saved = 1.0 - skipped.median / done.median
-        return SkipRow(left_out, condition, done, skipped, f"{saved:.0%}")
+        return _skip_row(left_out, condition, *map(cost, options))
 
     return session.rows((skip[0], partial(row, *skip)) for skip in skips(workload))
+
+
+def _skip_row(left_out: str, condition: str, done: Timing, skipped: Timing) -> SkipRow:
+    saved = 1.0 - skipped.median / done.median
+    return SkipRow(left_out, condition, done, skipped, f"{saved:.0%}")
 
 
 # Suite `species`: overhead of `rollout_species` with one species.
@@ -296,54 +300,29 @@ SPECIES = {
 """Workloads of the suite by `TimingSession.size`; ones of few particles show the cost of a call."""
 
 
-@dataclass(frozen=True)
-class OneSpeciesRow:
-    """Times of a step [µs] of `rollout`, and of `rollout_species` with one species.
+def one_species_rows(session: TimingSession) -> list[SkipRow]:
+    """Return rows of what `rollout` skips, on CUDA also where graphs replay the calls."""
 
-    `what` is "inference" or "training", `calls` "graph" for replays of a CUDA graph, else "eager".
-    `ratio` is the time of species / that of `rollout`.
-    """
+    def row(workload: Workload, train: bool, graph: bool) -> SkipRow:
+        x, s = workload.worlds(session.device)
+        counts = [workload.particle_count]
 
-    workload: str
-    what: str
-    calls: str
-    rollout_us: Timing
-    species_us: Timing
-    ratio: float
+        def roll_species(rule: NPARule, *arguments: Any, **options: Any) -> tuple[Tensor, ...]:
+            options |= {"counts": counts, "density_counts": counts}
+            return rollout_species([rule], *arguments, **options)
 
+        times = []
+        # Both draw the same masks.
+        for roll in (roll_species, rollout):
+            run, generator = rollout_call(workload, x, s, train=train, roll=roll)
+            cost = session.cost(run, graph=graph, generator=generator)
+            times.append(cost.time.divided(workload.steps))
+        what = f"{'training' if train else 'inference'}, {'graph' if graph else 'eager'}"
+        return _skip_row(f"species, {workload.name}", what, *times)
 
-def one_species_rows(session: TimingSession) -> list[OneSpeciesRow]:
-    """Return rows of inference and training of each workload, on CUDA also by graphs."""
-    return session.rows(
-        (
-            f"one species, {'training' if train else 'inference'} of {workload.name}",
-            partial(_species_row, session, workload, train, graph),
-        )
-        for workload in SPECIES[session.size]
-        for train in (False, True)
-        for graph in ((False, True) if session.cuda else (False,))
-    )
-
-
-def _species_row(
-    session: TimingSession, workload: Workload, train: bool, graph: bool
-) -> OneSpeciesRow:
-    x, s = workload.worlds(session.device)
-
-    def roll_species(rule: NPARule, *arguments: Any, **options: Any) -> tuple[Tensor, ...]:
-        count = [workload.particle_count]
-        return rollout_species([rule], *arguments, counts=count, density_counts=count, **options)
-
-    times = []
-    # Both draw the same masks.
-    for roll in (rollout, roll_species):
-        run, generator = rollout_call(workload, x, s, train=train, roll=roll)
-        cost = session.cost(run, graph=graph, generator=generator)
-        times.append(cost.time.divided(workload.steps))
-    plain, species = times
-    what, calls = "training" if train else "inference", "graph" if graph else "eager"
-    ratio = species.median / plain.median
-    return OneSpeciesRow(workload.name, what, calls, plain, species, ratio)
+    graphs = (False, True) if session.cuda else (False,)
+    cases = itertools.product(SPECIES[session.size], (False, True), graphs)
+    return session.rows((f"one species, {case}", partial(row, *case)) for case in cases)
 
 
 # The suites

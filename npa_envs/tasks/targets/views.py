@@ -24,6 +24,7 @@ from npa_envs.atomic_files import home_path, read_json
 from npa_envs.checks import check_count, is_real
 from npa_envs.errors import NPAError, shown, suggest
 from npa_envs.ops import Cameras, cameras_of_poses, look_at, orbit
+from npa_envs.ops.pictures.triangles import WRAP_NUMBERS, TexturedFaces, nearest_triangles
 from npa_envs.tasks.targets.images import (
     BACKGROUND_TOLERANCE,
     FloatImage,
@@ -32,7 +33,7 @@ from npa_envs.tasks.targets.images import (
     open_image,
     scaled_square,
 )
-from npa_envs.tasks.targets.meshes import RADIUS, Mesh, draw_mesh, load_mesh
+from npa_envs.tasks.targets.meshes import RADIUS, Mesh, linear_light, load_mesh, srgb_values
 from npa_envs.tasks.targets.notes import left_out
 from npa_envs.tasks.targets.splat_files import GaussianCloud, draw_splats, ply_kind, read_splats
 
@@ -523,3 +524,113 @@ def _undistorted(
     )
     pixels = sampled[0].movedim(0, -1).round().clamp(0.0, 255.0).to(torch.uint8).numpy()
     return Image.fromarray(pixels, "RGBa").convert("RGBA")
+
+
+# Pictures of meshes.
+
+LIGHT = (0.35, 0.80, 0.50)
+"""Direction towards the light, fixed in the world; it need not have length 1."""
+
+AMBIENT = 0.6
+"""Brightness of a surface that faces away from the light, where 1 is one that faces it."""
+
+SAMPLES = 2
+"""Number of samples along each side of a pixel."""
+
+MAX_TEXELS, MAX_ALL_TEXELS = 2**24, 2**26
+"""Maximum number of pixels of a texture, 4096 x 4096, and of all textures of a mesh together: those
+with more are halved."""
+
+BATCH_LIMIT = 2**22
+"""Maximum number of samples, and of vertices, of the views that are drawn in one batch; a single
+view may have more."""
+
+
+def halved(pixels: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Return an sRGB picture [H, W, 3] at half its size, averaged in linear light."""
+    size, channels = (max(pixels.shape[1] // 2, 1), max(pixels.shape[0] // 2, 1)), []
+    for k in range(3):
+        channel = Image.fromarray(_BRIGHTNESS.astype(np.float32)[pixels[..., k]])
+        half = np.asarray(channel.resize(size, Image.Resampling.BOX))
+        channels.append((255.0 * srgb_values(half)).round().astype(np.uint8))
+    return np.stack(channels, axis=-1)
+
+
+_BRIGHTNESS = linear_light(np.arange(256) / 255.0)
+
+
+def _textured_faces(mesh: Mesh, light: NDArray[np.float64]) -> TexturedFaces | None:
+    """Return a mesh's textures with all their levels; `light`: brightness of each corner."""
+    if mesh.texture_of_face is None or mesh.uv is None or (mesh.texture_of_face < 0).all():
+        return None
+    limit = min(MAX_TEXELS, MAX_ALL_TEXELS // len(mesh.textures))
+    texels: list[NDArray[np.uint8]] = []
+    headers: list[list[tuple[int, int, int]]] = []
+    total = 0
+    for texture in mesh.textures:
+        pixels = texture.pixels
+        while pixels[..., 0].size > limit:
+            pixels = halved(pixels)
+        headers.append([])
+        while not headers[-1] or texels[-1].size > 3:
+            headers[-1].append((total, pixels.shape[1], pixels.shape[0]))
+            texels.append(pixels.reshape(-1, 3))
+            total += len(texels[-1])
+            pixels = halved(pixels)
+    depth = max(map(len, headers))
+    levels = [header + [(0, 0, 0)] * (depth - len(header)) for header in headers]
+    wrap = [[WRAP_NUMBERS[side] for side in texture.wrap] for texture in mesh.textures]
+    return TexturedFaces(
+        torch.from_numpy(np.concatenate(texels)),
+        torch.tensor(levels, dtype=torch.int32),
+        torch.tensor(wrap, dtype=torch.int32),
+        torch.from_numpy(_BRIGHTNESS),
+        torch.from_numpy(mesh.texture_of_face.astype(np.int32)),
+        torch.from_numpy(np.nan_to_num(mesh.uv).astype(np.float64, order="C").clip(-1e9, 1e9)),
+        torch.from_numpy(light),
+    )
+
+
+def draw_mesh(mesh: Mesh, cameras: Cameras) -> NDArray[np.float32]:
+    """Return pictures of a mesh by V cameras, [V, H, W, 4]: colours times alpha, alpha, in [0, 1].
+
+    Surfaces are matt and lit from a direction fixed in the world. Textures finer than pixels are
+    averaged in linear light. Both sides of triangles are visible. Triangles with a vertex nearer
+    than `cameras.near` are left out. The top row is first.
+    """
+    light = np.asarray(LIGHT) / np.linalg.norm(LIGHT)
+    lit = AMBIENT + (1.0 - AMBIENT) * (mesh.normals() @ light).clip(0.0, 1.0)
+    light = lit[mesh.faces]
+    colours_of_corners = mesh.colours * light[..., None]
+    textures = _textured_faces(mesh, light)
+    if textures is not None:
+        textured = textures.of_face.numpy() >= 0
+        colours_of_corners[textured] = linear_light(mesh.colours[textured])
+    # Copies: torch accepts no arrays with negative strides or read-only ones.
+    colours, vertices = (
+        torch.from_numpy(np.array(values, dtype=np.float64, order="C"))
+        for values in (colours_of_corners, mesh.vertices)
+    )
+    faces = torch.from_numpy(np.array(mesh.faces, dtype=np.int64, order="C"))
+    motions = cameras.world_to_camera.double().cpu()
+    lenses = SAMPLES * cameras.intrinsics.double().cpu().expand(len(motions), 4)[:, None]
+    height, width = SAMPLES * cameras.height, SAMPLES * cameras.width
+    batch_size = max(1, BATCH_LIMIT // max(height * width, len(vertices), 3 * len(faces)))
+    pictures = []
+    batches = (torch.split(each, batch_size) for each in (motions, lenses))
+    for motion, lens in zip(*batches, strict=True):
+        local = vertices @ motion[:, :3, :3].mT + motion[:, None, :3, 3]
+        depth = local[..., 2].clamp(min=cameras.near)
+        fine = nearest_triangles(
+            local[..., :2] / depth[..., None] * lens[..., :2] + lens[..., 2:],
+            1.0 / depth,
+            colours,
+            faces,
+            (local[..., 2] >= cameras.near)[:, faces].all(dim=-1),
+            textures,
+            width=width,
+            height=height,
+        )
+        coarse = fine.view(-1, cameras.height, SAMPLES, cameras.width, SAMPLES, 4)
+        pictures.append(coarse.mean(dim=(2, 4)).float())
+    return torch.cat(pictures).numpy()

@@ -176,7 +176,7 @@ precision mediump float;
 in vec2 at; uniform sampler2D sums; uniform vec3 background; out vec4 shown;
 void main() {
   vec4 sum = texture(sums, at);
-  float cover = smoothstep(0.06, 0.3, sum.a);
+  float cover = smoothstep(0.35, 1.25, sum.a);
   shown = vec4(mix(background, sum.rgb / max(sum.a, 1e-3), cover), 1.0);
 }`;
 
@@ -203,8 +203,9 @@ precision mediump float;
 in vec3 tint; uniform vec3 ink; out vec4 shown;
 void main() { shown = vec4(ink, 1.0) * tint.r; }`;
 
-// Sums of soft spots cover the background from a sixth of a spot on, so that edges are crisp and bodies without gaps.
-const SOFT_WIDTH = 0.62; // standard deviation of a soft spot, in those of the scene's spots
+// Sums of soft spots cover the background by the thresholds of SHOW_FRAGMENT: outlines are smooth, bodies have no gaps, and
+// lone particles are small and faint.
+const SOFT_WIDTH = 0.88; // standard deviation of a soft spot, in those of the scene's spots
 const SOFT_REACH = 3.2; // standard deviations of a soft spot that are drawn
 const BUFFER_SPOT = 1.6; // standard deviation of a soft spot in the buffer of sums [pixels], at most
 
@@ -347,7 +348,7 @@ function linked(gl, vertex, fragment) {
 const PLAIN_PIXELS = [640, 1200]; // on the longer side of the small picture, least and most
 const PLAIN_TIME = 16; // milliseconds that a picture may take
 const COVERS = Float32Array.from({ length: 1024 }, (_, k) => {
-  const rise = Math.min(1, Math.max(0, (k / 1024 - 0.06) / 0.24));
+  const rise = Math.min(1, Math.max(0, (k / 512 - 0.35) / 0.9));
   return rise * rise * (3 - 2 * rise);
 });
 
@@ -492,7 +493,7 @@ function showSoft({ data, width, height }, sums, columns, rows, background) {
     for (let k = 0; k < 4 * columns; k++) line[k] = sums[above + k] + down * (sums[below + k] - sums[above + k]);
     for (let x = 0; x < width; x++, p++) {
       const column = places[x] | 0, next = places[x] - column, rest = 1 - next, l = 4 * column;
-      const weight = rest * line[l + 3] + next * line[l + 7], cover = COVERS[Math.min(full, (weight * 1024) | 0)];
+      const weight = rest * line[l + 3] + next * line[l + 7], cover = COVERS[Math.min(full, (weight * 512) | 0)];
       if (cover === 0) pixels[p] = bare;
       else {
         const part = 1 - cover, near = (rest * cover) / weight, far = (next * cover) / weight;

@@ -29,7 +29,7 @@ const MEANINGS = {
 };
 
 // Colours of classes, those of PALETTE of npa_envs/tasks/point_classification.py, repeated for more.
-const CLASSES = ["red", "green", "yellow", "blue", "orange", "purple", "cyan", "pink", "brown", "black"];
+const CLASSES = ["red", "green", "yellow", "blue", "orange", "purple", "cyan", "pink", "brown", "lavender"];
 
 // SVG paths on a square of side 24, by the names of brushes and controls.
 const ICONS = {
@@ -156,6 +156,8 @@ class Page {
   play(on) {
     this.world.playing = on;
     this.controls.showPlaying();
+    this.brushes.note = "";
+    this.brushes.showHint();
     this.send({ type: "play", on });
   }
 
@@ -228,6 +230,7 @@ class Brushes {
     this.chosen = LOOK;
     this.pointers = new Map();
     this.looking = false; // whether pressed pointers move the camera
+    this.note = ""; // what the last stroke has not done, for the user
     // A use from press to release: nearness of what it touches, and pixels where it began, is now, and last acted.
     this.stroke = null;
     const canvas = (this.canvas = page.canvas);
@@ -258,6 +261,7 @@ class Brushes {
   // Takes the brush of a name, or "look" if the world does not offer it or it can do nothing.
   choose(name) {
     this.chosen = this.offered.find((brush) => brush.name === name && !this.lack(brush)) ?? LOOK;
+    this.note = "";
     for (const button of $("brushes").children)
       button.setAttribute("aria-checked", String(button.dataset.brush === this.chosen.name));
     if (this.chosen.takes === "rule") $("brush").open = true;
@@ -266,10 +270,26 @@ class Brushes {
     this.canvas.style.cursor = this.chosen === LOOK ? "grab" : "crosshair";
   }
 
-  // Says what the brush does, and which rule it takes.
+  // Says what the brush does, and which rule it takes; or what the last stroke has not done.
   showHint() {
-    const { label, takes } = this.chosen, other = takes === "rule" && $("other").value;
-    $("hint").textContent = other ? `${label} (${other})` : label;
+    const { note, chosen: { label, takes } } = this, other = takes === "rule" && $("other").value;
+    $("hint").textContent = note || (other ? `${label} (${other})` : label);
+  }
+
+  // Says that a stroke meets no particles, or that those that it meets act only in a world that runs.
+  noteStroke({ tool, at, move, radius, rule }) {
+    const { stroke, page: { frame, world: { dimension, box, playing } } } = this;
+    if (tool === "add" || stroke.met || !frame) return;
+    const { positions } = frame, square = move.reduce((sum, part) => sum + part * part, 0) || 1;
+    for (let i = 0; i < positions.length && !stroke.met; i += dimension) {
+      const offset = at.map((v, d) => positions[i + d] - v);
+      if (box) offset.forEach((v, d) => (offset[d] -= box[d] * Math.round(v / box[d])));
+      const along = offset.reduce((sum, v, d) => sum + v * move[d], 0) / square, part = Math.min(1, Math.max(0, along));
+      stroke.met = Math.hypot(...offset.map((v, d) => v - part * move[d])) <= radius;
+    }
+    const waits = tool === "graft" && !playing ? `They follow ${rule} once the world plays` : "";
+    this.note = stroke.met ? waits : "No particles under the brush";
+    this.showHint();
   }
 
   // The position of the pointer on the canvas [pixels].
@@ -360,6 +380,7 @@ class Brushes {
     if (brush.takes === "rule") message.rule = $("other").value;
     if (dimension === 3) message.view = camera.axes[2];
     this.page.send(message);
+    this.noteStroke(message);
   }
 
   // The brush's radius [length units]; for a line the width of its gap.

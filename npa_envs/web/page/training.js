@@ -154,7 +154,7 @@ export class TrainingCard {
       this.change({ stopping: id });
     });
     return [
-      this.heading(`Learning ${name}`), bar,
+      this.heading(`Learning ${name}`), bar, ...this.target(),
       text(stopping ? "Stopping; what it has learned is saved…" : words[state]), text(note),
       row(this.quality(), ...(has_rule && this.showing !== id ? [this.watch()] : []), ...(stopping ? [] : [stop])),
     ];
@@ -168,7 +168,8 @@ export class TrainingCard {
     });
     const how = state === "done" ? `Learned in ${duration(seconds)}` : `Stopped at iteration ${iteration} of ${total}`;
     return [
-      this.heading(name), text(this.showing === id ? `${how}. Cut it, wipe a part of it.` : `${how}.`), this.quality(),
+      this.heading(name), ...this.target(),
+      text(this.showing === id ? `${how}. Cut it, wipe a part of it.` : `${how}.`), this.quality(),
       row(link("Save rule", "rule.safetensors", ".safetensors"), link("Save page", "page.html", ".html"),
         this.showing === id ? button("Back", () => this.leave()) : this.watch(),
         button("Another", () => this.change({ choosing: true }))),
@@ -181,6 +182,15 @@ export class TrainingCard {
     const close = button("\u00D7", () => this.change({ open: false, choosing: false }));
     close.setAttribute("aria-label", "Fold");
     return row(make("h2", { textContent: words }), close);
+  }
+
+  // The picture that is learned, made once: it must not flicker.
+  target() {
+    const { id, picture } = this.event;
+    if (!picture) return [];
+    const src = addressOf(`training/${id}/${picture}`).href;
+    if (this.image?.src !== src) this.image = make("img", { src, alt: "The picture that is learned" });
+    return [this.image];
   }
 
   watch() {
