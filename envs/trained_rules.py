@@ -190,7 +190,8 @@ class RuleDrivenWorlds(BatchedWorlds):
         """Step the worlds without synchronising; return observations, in `out` if it is given."""
         if self._graph is None:
             self._action = torch.zeros(action.shape, device=self.device)
-            self._graph = GraphedCallable(self._step_and_observe, self.device)
+            # Launched kernel by kernel: no machine with CUDA has run the capture yet.
+            self._graph = GraphedCallable(self._step_and_observe, self.device, captured=False)
             self.random_steps = self.task.config.rule_steps
         load_async(action, self._action)
         flag_unless_finite(self._action, self.enabled)
@@ -200,7 +201,7 @@ class RuleDrivenWorlds(BatchedWorlds):
         return self._observed.clone() if out is None else out.copy_(self._observed)
 
     def _step_and_observe(self) -> None:
-        """Make the step of the loaded actions, if these are finite; captured on CUDA."""
+        """Make the step of the loaded actions, if these are finite."""
         is_made = self.enabled.bool()
         stepped = self._stepped(torch.where(is_made, self._action, 0.0))
         for value, new in zip(self.particles[:2], stepped, strict=True):
