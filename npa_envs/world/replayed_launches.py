@@ -18,6 +18,7 @@ from torch import Tensor
 from torch.utils._python_dispatch import is_in_torch_dispatch_mode
 
 from npa_envs.ops.launch import RecordedLaunches
+from npa_envs.ops.perception_passes import perception_threads
 from npa_envs.ops.sort import sorts_at_once
 from npa_envs.world.capture_cache import LAUNCHED_FIRST, CallGroups
 from npa_envs.world.particles import Particles, combined
@@ -94,7 +95,7 @@ class ReplayedSteps:
             if self._mask is not None and mask is not None:
                 self._mask.copy_(mask)
             count = max(sum(counts), 1)
-            step.launches.replay(0, step.split, last_count=count)
+            step.launches.replay(0, step.split, last_count=perception_threads(count))
             # Kept alive until the launch has read it.
             updates = rule_step.updates_of(step.rows[:count], counts)
             step.launches.move(step.slots, updates)
