@@ -163,11 +163,16 @@ def domain_types(space_dim: int, scalar: type) -> SimpleNamespace:
         return base + begin, base + end
 
     @wp.func
+    def periodic_image_along(domain: Domain, d: int, difference: scalar):
+        """Return the shortest image of a difference of coordinates in a box [length units]."""
+        return difference - domain.box[d] * wp.round(difference * domain.inverse_box[d])
+
+    @wp.func
     def periodic_image(domain: Domain, difference: vector):
         """Return the shortest image of a difference of positions in a box [length units]."""
-        result = difference
+        result = vector()
         for d in range(wp.static(space_dim)):
-            result[d] -= domain.box[d] * wp.round(difference[d] * domain.inverse_box[d])
+            result[d] = periodic_image_along(domain, d, difference[d])
         return result
 
     @wp.func

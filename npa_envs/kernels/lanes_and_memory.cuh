@@ -87,7 +87,7 @@ CUDA_CALLABLE inline Value read_at(const wp::array_t<Part>& values, int index)
 #if defined(__CUDA_ARCH__)
     load_chunks<BYTES>(result, values.data + index);
 #else
-    for (unsigned k = 0; k < sizeof(Value) / sizeof(Part); ++k) result[k] = values.data[index + k];
+    __builtin_memcpy(&result, values.data + index, sizeof(result));
 #endif
     return result;
 }
@@ -98,7 +98,7 @@ CUDA_CALLABLE inline void write_at(const wp::array_t<Part>& values, int index, V
 #if defined(__CUDA_ARCH__)
     store_chunks<16>(values.data + index, value);
 #else
-    for (unsigned k = 0; k < sizeof(Value) / sizeof(Part); ++k) values.data[index + k] = value[k];
+    __builtin_memcpy(values.data + index, &value, sizeof(value));
 #endif
 }
 
@@ -187,6 +187,54 @@ CUDA_CALLABLE inline Group add_scaled(Group total, Part factor, Group value)
     sum += product;
     __builtin_memcpy(&total, &sum, sizeof(total));
     return total;
+#endif
+}
+
+// total + factors x value, row by row; as `add_scaled`.
+template <typename Rows, typename Factors, typename Group>
+CUDA_CALLABLE inline Rows add_outer(Rows total, Factors factors, Group value)
+{
+    for (unsigned r = 0; r < sizeof(total) / sizeof(value); ++r) {
+        Group& row = reinterpret_cast<Group&>(total.data[r]);
+        row = add_scaled(row, factors[r], value);
+    }
+    return total;
+}
+
+// A bit for each value that is below a limit.
+template <typename Values, typename Part>
+CUDA_CALLABLE inline unsigned bits_below(Values values, Part limit)
+{
+    constexpr unsigned count = sizeof(values) / sizeof(limit);
+#if defined(__clang__) && !defined(__CUDA_ARCH__)
+    typedef Part numbers __attribute__((vector_size(sizeof(values))));
+    numbers all;
+    __builtin_memcpy(&all, &values, sizeof(values));
+    auto below = all < limit;
+    for (unsigned i = 0; i < count; ++i) below[i] &= 1 << i;
+    return __builtin_reduce_or(below);
+#else
+    unsigned bits = 0;
+    for (unsigned i = 0; i < count; ++i) bits |= unsigned(values[i] < limit) << i;
+    return bits;
+#endif
+}
+
+// The sum of the first `count` values, in vector registers.
+template <typename Value>
+CUDA_CALLABLE inline int sum_of_first(const wp::array_t<Value>& values, int count)
+{
+    int sum = 0;
+    for (int i = 0; i < count; ++i) sum += values.data[i];
+    return sum;
+}
+
+CUDA_CALLABLE inline int lowest_bit(unsigned bits)
+{
+#if defined(__CUDA_ARCH__)
+    return __ffs(bits) - 1;
+#else
+    return __builtin_ctz(bits);
 #endif
 }
 

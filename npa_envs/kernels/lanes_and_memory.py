@@ -117,6 +117,12 @@ def make_add_scaled(group: type) -> Any:
     return native.function("add_scaled", **types, returns=group)
 
 
+@cached_under_lock()
+def make_add_outer(rows: type, vector: type, group: type) -> Any:
+    """Return a Warp function for total + factors * value of each row; as `make_add_scaled`."""
+    return native.function("add_outer", total=rows, factors=vector, value=group, returns=rows)
+
+
 of_warp = native.function("shuffle", value=int, thread=int, returns=int)
 scalar_of_warp = native.function("shuffle", value=float, thread=int, returns=float)
 """The value of a thread of the warp; on a CPU this thread's own."""

@@ -49,11 +49,10 @@ def smoothing_slope(squared_distance: Any, inverse_squared_eps: Any, norm: Any):
 @wp.func
 def spiky_factor(distance: Any, inverse_eps: Any, norm: Any):
     """Factor f of the spiky gradient kernel K(r) = f r; zero at r = 0 [1 / length^(D+2)]."""
-    factor = type(norm)(0.0)
-    if distance > type(norm)(0.0):
-        falloff = type(norm)(1.0) - distance * inverse_eps
-        factor = norm * falloff * falloff / distance
-    return factor
+    falloff = type(norm)(1.0) - distance * inverse_eps
+    factor = norm * falloff * falloff / distance
+    # Not by a branch: several are computed together.
+    return wp.where(distance > type(norm)(0.0), factor, type(norm)(0.0))
 
 
 @wp.func
@@ -77,13 +76,15 @@ def spiky_radial_slope(distance: Any, inverse_eps: Any, norm: Any):
 
 
 @wp.func
-def log1p(value: Any):
-    """log(1 + value), accurate also for values near 0."""
-    one_plus = type(value)(1.0) + value
-    result = value
-    if one_plus > type(value)(1.0):
-        result = wp.log(one_plus) * (value / (one_plus - type(value)(1.0)))
-    return result
+def log_scale_of(length: Any, logarithm: Any):
+    """Factor L(v) / v of the logarithmic scaling, from |v| and log(1 + |v|) without its rounding.
+
+    `logarithm` is log(1 + |v|) of the rounded sum; the factor is accurate also for |v| near 0.
+    """
+    one = type(length)(1.0)
+    one_plus = one + length
+    exact = logarithm * (length / (one_plus - one))
+    return wp.where(one_plus > one, exact / length, one)
 
 
 @wp.func
@@ -99,13 +100,56 @@ def log_scaled_huge(v: Any):
 def log_scaled(v: Any):
     """Logarithmic scaling L(v) = log(1 + |v|) v / |v| of a vector, 0 at 0."""
     length = wp.length(v)
-    factor = type(length)(1.0)
-    if length > type(length)(0.0):
-        factor = log1p(length) / length
-    result = factor * v
+    result = log_scale_of(length, wp.log(type(length)(1.0) + length)) * v
     if wp.isinf(length):
         result = log_scaled_huge(v)
     return result
+
+
+@cached_under_lock()
+def make_log_scaled(space_dim: int, scalar: type, width: int) -> Any:
+    """Return a Warp function for L(`scale` times gradient) of `width` gradients, [D, width]."""
+    vector, numbers = wp.types.vector(space_dim, scalar), wp.types.vector(width, scalar)
+    gradient_type = wp.types.matrix((space_dim, width), scalar)
+
+    @wp.func
+    def log_scaled_gradient(scale: scalar, gradient: gradient_type):
+        scaled = gradient_type()
+        lengths = numbers()
+        logarithms = numbers()
+        longest = scalar(0.0)
+        # Loops of one operation for all, which a CPU's compiler puts in vector registers.
+        c = wp.int32(0)
+        while c < wp.static(width):
+            squared = scalar(0.0)
+            for d in range(wp.static(space_dim)):
+                scaled[d, c] = scale * gradient[d, c]
+                squared += scaled[d, c] * scaled[d, c]
+            lengths[c] = wp.sqrt(squared)
+            longest = wp.max(longest, lengths[c])
+            c += 1
+        c = wp.int32(0)
+        while c < wp.static(width):
+            logarithms[c] = wp.log(scalar(1.0) + lengths[c])
+            c += 1
+        c = wp.int32(0)
+        while c < wp.static(width):
+            factor = log_scale_of(lengths[c], logarithms[c])
+            for d in range(wp.static(space_dim)):
+                scaled[d, c] *= factor
+            c += 1
+        if wp.isinf(longest):
+            for c in range(wp.static(width)):
+                if wp.isinf(lengths[c]):
+                    along = vector()
+                    for d in range(wp.static(space_dim)):
+                        along[d] = scale * gradient[d, c]
+                    along = log_scaled_huge(along)
+                    for d in range(wp.static(space_dim)):
+                        scaled[d, c] = along[d]
+        return scaled
+
+    return log_scaled_gradient
 
 
 @wp.func

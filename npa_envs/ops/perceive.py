@@ -157,9 +157,10 @@ def perception_fields(
         grad1=x.new_empty(plan.total, state_dim, space_dim),
         drho=densities.density_gradient[ordered.row_of].to(x.dtype),
     )
+    kernels = portable_kernels(plan)
     launch(
-        portable_kernels(plan).gather_fields,
-        (plan.total, plan.group_count),
+        kernels.gather_fields,
+        (-(-plan.total // kernels.together), plan.group_count),
         x.device,
         plan.domain,
         particle_count,
@@ -223,11 +224,11 @@ def _perceive_rows(
 
 
 class _PerceiveRows(torch.autograd.Function):
-    """Autograd function of `_saved_perception`; its backward pass is `perceive_rows_backward`."""
+    """Autograd function of `saved_perception`; its backward pass is `perceive_rows_backward`."""
 
     @staticmethod
     def forward(ctx: Any, *arguments: Any) -> tuple[Tensor, ...]:
-        saved, row_particle = _saved_perception(*arguments, True)
+        saved, row_particle = saved_perception(*arguments, True)
         _, s, _, static, _, masked, *_, physics = arguments
         ctx.set_materialize_grads(False)
         ctx.shape, ctx.masked, ctx.physics = s.shape, masked, physics
@@ -257,7 +258,7 @@ class _PerceiveRows(torch.autograd.Function):
         return x_bar, states_bar, *[None] * 7
 
 
-def _saved_perception(
+def saved_perception(
     x: Tensor,
     s: Tensor,
     mask: Tensor | None,
@@ -316,7 +317,7 @@ def perceive_rows(
     if torch.is_grad_enabled() and (x.requires_grad or s.requires_grad):
         perception, *maps = _PerceiveRows.apply(*arguments)  # type: ignore[no-untyped-call]
     else:
-        saved, row_particle = _saved_perception(*arguments, False)
+        saved, row_particle = saved_perception(*arguments, False)
         perception, maps = saved.perception, [saved.row_of, row_particle, saved.starts]
     row_of, row_particle, starts = maps if rows is None else rows[:3]
     return perception, Rows(row_of, row_particle, starts, x.shape[0] * x.shape[1] if masked else 0)

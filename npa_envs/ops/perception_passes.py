@@ -16,6 +16,7 @@ from npa_envs.kernels.lanes_and_memory import WARP
 from npa_envs.kernels.portable.adjoint import adjoint_kernels
 from npa_envs.kernels.portable.density import density_kernels
 from npa_envs.kernels.portable.perceive import perception_kernels
+from npa_envs.kernels.portable.search import PARTICLES
 from npa_envs.ops.backend import ListLayout
 from npa_envs.ops.custom_op import custom_op
 from npa_envs.ops.launch import launch
@@ -127,9 +128,10 @@ def compute_densities_in_cells(plan: KernelPlan, ordered: SortedWorlds) -> Densi
     positions = ordered.positions
     particles = positions.new_empty(plan.total, plan.space_dim + 1)
     density_gradient = positions.new_empty(plan.total, plan.space_dim, dtype=torch.float64)
+    kernels = density_kernels(plan.space_dim, plan.scalar, plan.on_cpu)
     launch(
-        density_kernels(plan.space_dim, plan.scalar, plan.on_cpu).compute_density,
-        plan.total,
+        kernels.compute_density,
+        -(-plan.total // kernels.together),
         positions.device,
         plan.domain,
         plan.particle_count,
@@ -142,6 +144,11 @@ def compute_densities_in_cells(plan: KernelPlan, ordered: SortedWorlds) -> Densi
         density_gradient,
     )
     return Densities(particles, density_gradient)
+
+
+def perception_threads(row_count: int) -> int:
+    """Return the first size of `perception_launch` for some rows on a CPU."""
+    return -(-row_count // PARTICLES)
 
 
 def perception_launch(
@@ -186,13 +193,15 @@ def perception_launch(
     if lists is None:
         neighbours, ends = densities.static_neighbours or (None, None)
         cells = ordered.starts, ends, neighbours, densities.particles
+        kernels = portable_kernels(plan, neighbours is not None)
         return (
-            portable_kernels(plan, neighbours is not None).perceive,
-            (row_count, group_count),
+            kernels.perceive,
+            (-(-row_count // kernels.together), group_count),
             out.device,
             plan.domain,
             plan.particle_count,
             *numbers,
+            row_count,
             group_count,
             limit,
             *cells,
@@ -313,7 +322,7 @@ def _gather_by_cells(
     rows = saved.row_of, saved.row_positions, saved.row_kernel_sum
     launch(
         kernels.gather_state_cotangents,
-        (plan.total, group_count),
+        (-(-plan.total // kernels.together), group_count),
         bar.device,
         plan.domain,
         plan.particle_count,

@@ -43,7 +43,8 @@ def _update_particles(
 ) -> tuple[Tensor, Tensor, Tensor]:
     space_dim, state_dim = int(x.shape[2]), s.shape[2]
     total, particle_threads = x.shape[0] * x.shape[1], 1 + -(-state_dim // THREAD_CHANNELS)
-    kernels = update_kernels(space_dim, SCALARS[x.dtype])
+    on_cpu = x.device.type == "cpu"
+    kernels = update_kernels(space_dim, SCALARS[x.dtype], on_cpu)
     if update.numel() >= MAX_INDEX:
         raise NPAError(
             f"updates must stay below {MAX_INDEX} numbers in one batch, got "
@@ -58,7 +59,7 @@ def _update_particles(
     aligned = aligned and is_aligned(update, alignment)
     launch(
         kernels.apply_update,
-        -(-total // MOVED_TOGETHER) * MOVED_TOGETHER * particle_threads,
+        -(-total // MOVED_TOGETHER) * (1 if on_cpu else MOVED_TOGETHER * particle_threads),
         x.device,
         physics.max_displacement * physics.dt,
         physics.dt,
@@ -79,7 +80,7 @@ def _update_particles(
 
 
 @custom_op("npa::update_particles_backward")
-def _update_particles_backward(
+def update_particles_backward(
     update: Tensor,
     new_x_bar: Tensor,
     new_s_bar: Tensor,
@@ -89,8 +90,9 @@ def _update_particles_backward(
     row_base: int,
     physics: Physics,
 ) -> Tensor:
+    """Return the gradient of updates from those of new positions, states and path lengths."""
     space_dim, state_dim = int(new_x_bar.shape[2]), new_s_bar.shape[2]
-    kernels = update_kernels(space_dim, SCALARS[update.dtype])
+    kernels = update_kernels(space_dim, SCALARS[update.dtype], update.device.type == "cpu")
     update_bar = torch.empty_like(update, memory_format=torch.contiguous_format)
     launch(
         kernels.pull_back_update,
@@ -143,7 +145,7 @@ class _UpdateParticles(torch.autograd.Function):
             others = s_bar.contiguous(), path_bar.contiguous()
             free, *_ = _update_particles(update, x, *others, row_of, physics, False)
             x_bar = x_bar * _mirror_signs(free, physics.box)
-        update_bar = _update_particles_backward(
+        update_bar = update_particles_backward(
             update, x_bar, s_bar, path_bar, row_particle, starts, ctx.row_base, physics
         )
         return update_bar, x_bar, s_bar, path_bar, None, None

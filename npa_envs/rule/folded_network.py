@@ -5,6 +5,7 @@ A row is the input of the network for one particle: its perception vector z, the
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import torch
@@ -29,6 +30,29 @@ def _blocked_product(hidden: Tensor, weight: Tensor) -> Tensor:
     return torch.bmm(left, right).sum(dim=0)
 
 
+def run_layers(rows: Tensor, hidden_weight: Tensor, output_weight: Tensor) -> tuple[Tensor, Tensor]:
+    """Return hidden units relu(rows W1.T), and their product with W2.T; not differentiable."""
+    hidden = torch.relu_(rows @ hidden_weight.T)
+    return hidden, _blocked_product(hidden, output_weight)
+
+
+def layers_backward(
+    update_bar: Tensor,
+    rows: Tensor,
+    hidden: Tensor,
+    hidden_weight: Tensor,
+    output_weight: Tensor,
+    *,
+    needs: Sequence[bool],
+) -> tuple[Tensor | None, ...]:
+    """Return the gradients of rows, W1 and W2, from that of the outputs of `run_layers`."""
+    hidden_bar = torch.ops.aten.threshold_backward(update_bar @ output_weight, hidden, 0.0)
+    rows_bar = hidden_bar @ hidden_weight if needs[0] else None
+    if not any(needs[1:]):
+        return rows_bar, None, None
+    return rows_bar, hidden_bar.T @ rows, update_bar.T @ hidden
+
+
 class _TwoLayers(torch.autograd.Function):
     """relu(rows W1.T) W2.T, with the second product summed in blocks to limit rounding.
 
@@ -37,19 +61,15 @@ class _TwoLayers(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, rows: Tensor, hidden_weight: Tensor, output_weight: Tensor) -> Tensor:
-        hidden = torch.relu(rows @ hidden_weight.T)
+        hidden, update = run_layers(rows, hidden_weight, output_weight)
         ctx.save_for_backward(rows, hidden, hidden_weight, output_weight)
-        return _blocked_product(hidden, output_weight)
+        return update
 
     @staticmethod
     @without_autocast
     def backward(ctx: Any, update_bar: Tensor) -> tuple[Tensor | None, ...]:
-        rows, hidden, hidden_weight, output_weight = ctx.saved_tensors
-        hidden_bar = torch.ops.aten.threshold_backward(update_bar @ output_weight, hidden, 0.0)
-        rows_bar = hidden_bar @ hidden_weight if ctx.needs_input_grad[0] else None
-        if not any(ctx.needs_input_grad[1:]):
-            return rows_bar, None, None
-        return rows_bar, hidden_bar.T @ rows, update_bar.T @ hidden
+        rows, hidden, *weights = ctx.saved_tensors
+        return layers_backward(update_bar, rows, hidden, *weights, needs=ctx.needs_input_grad)
 
 
 def without_small(update: Tensor, dead_zone: float) -> Tensor:
@@ -93,8 +113,7 @@ class FoldedRule(NamedTuple):
         elif torch.is_grad_enabled():
             update = _TwoLayers.apply(rows, self.hidden_weight, self.output_weight)  # type: ignore[no-untyped-call]
         else:
-            hidden = torch.relu_(rows @ self.hidden_weight.T)
-            update = _blocked_product(hidden, self.output_weight)
+            update = run_layers(rows, self.hidden_weight, self.output_weight)[1]
         return without_small(update, self.dead_zone)
 
 

@@ -6,7 +6,7 @@ A rollout takes the first way whose condition is met; `run_all_steps` is the las
 |--------------------------|------------------------------------------------|----------------------|
 | skip steps once at rest  | rule with dead zone, no gradients, many steps  | `execute`            |
 | replay CUDA graphs       | CUDA, third call on                            | capture_cache.py     |
-| replay recorded launches | CPU, no gradients, small worlds, third call on | replayed_launches.py |
+| replay recorded launches | CPU, small worlds, third call on               | replayed_launches.py |
 | launch each step         | none                                           | `RolloutSpec.launch` |
 
 "Third" counts calls with the same shapes and options. What a step is, `RolloutSpec.make_step`
@@ -137,7 +137,8 @@ def run_all_steps(
     particles = particles.with_zero_paths()
     step = spec.make_step(rules, particles)
     if watch is None and type(step) is RuleStep:
-        replayed = replay_launches(step, particles, generator, spec.steps, spec.keep_every)
+        stores = spec.memory == "store"
+        replayed = replay_launches(step, particles, generator, spec.steps, spec.keep_every, stores)
         if replayed is not None:
             return replayed
     return spec.launch(step, rules, particles, generator, watch)

@@ -16,7 +16,8 @@ BOX = (1.4, 1.4)
 
 @pytest.fixture(autouse=True)
 def _nothing_prepared(monkeypatch):
-    monkeypatch.setattr(replayed_launches, "_groups", type(replayed_launches._groups)())
+    for name in ("_groups", "_trained_groups"):
+        monkeypatch.setattr(replayed_launches, name, type(replayed_launches._groups)())
 
 
 def make_rule(dtype=torch.float32, seed=0, **options):
@@ -38,8 +39,20 @@ def run(rule, x, s, steps=5, *, by_world=False, seed=3, **options):
     return *result, generator.uniform(2) if by_world else torch.rand(2, generator=generator)
 
 
-def steps_ready():
-    return [steps for group in replayed_launches._groups.values() for steps in group.free]
+def steps_ready(groups="_groups"):
+    return [steps for group in getattr(replayed_launches, groups).values() for steps in group.free]
+
+
+def graph(rule, x, s, seed, steps=4, **options):
+    """Return worlds after a rollout with gradients, and the tensors that get them."""
+    inputs = [x.clone().requires_grad_(), s.clone().requires_grad_(), *rule.parameters()]
+    options = {"generator": torch.Generator().manual_seed(seed), **options}
+    return npa_envs.rollout(rule, *inputs[:2], steps, return_path_length=True, **options), inputs
+
+
+def derivatives(after, inputs, **options):
+    loss = sum((value**2).sum() for value in after)
+    return torch.autograd.grad(loss, inputs, allow_unused=True, **options)
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=str)
@@ -102,6 +115,35 @@ def test_worlds_of_inference_mode_are_stepped_too():
             ready = run(rule, x, s)
     assert len(steps_ready()) == 1
     assert_same((ready, run(rule, x, s)), (launched, launched))
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=str)
+@pytest.mark.parametrize(
+    ("form", "options"),
+    [
+        ({}, {}),
+        ({}, {"box": BOX, "update_prob": 1.0}),
+        ({"dead_zone": 0.02}, {"position_noise": 0.01, "update_prob": 0.3}),
+    ],
+    ids=["open", "box", "dead zone and noise"],
+)
+def test_replayed_gradients_are_the_launched_ones(form, options, dtype):
+    rule, (x, s) = make_rule(dtype, **form), worlds(dtype)
+    calls, launched = ((3, 4), (4, 2), (5, 6)), []
+    for seed, steps in calls:
+        replayed_launches._trained_groups.clear()
+        after, inputs = graph(rule, x, s, seed, steps, **options)
+        launched.append((*after, *derivatives(after, inputs)))
+    assert not steps_ready("_trained_groups")
+    for seed, steps in calls[:2]:
+        graph(rule, x, s, seed, steps, **options)
+    # Several graphs at a time, each with buffers of its own, and one of them used twice.
+    graphs = [graph(rule, x, s, seed, steps, **options) for seed, steps in calls]
+    derivatives(*graphs[1], retain_graph=True)
+    replayed = [(*after, *derivatives(after, inputs)) for after, inputs in graphs]
+    assert_same(replayed, launched)
+    del graphs, after, inputs, replayed
+    assert len(steps_ready("_trained_groups")) == len(calls)
 
 
 def test_what_needs_gradients_or_a_rule_of_its_own_is_launched():

@@ -27,7 +27,7 @@ from npa_envs.kernels.mathematics import (
     spiky_radial_slope,
 )
 from npa_envs.kernels.native_functions import PAIRS, in_ranges
-from npa_envs.kernels.portable.search import make_search
+from npa_envs.kernels.portable.search import lowest_bit, make_search
 
 STATE_REGISTERS = 64
 """Registers per thread of `gather_state_cotangents`, which mostly waits for memory."""
@@ -46,10 +46,11 @@ def adjoint_kernels(
     options = {"on_cpu": on_cpu, "gradient": state_gradient, "listed": listed}
     module = kernel_module("adjoint", space_dim, scalar, width=width, **options)
     space = group_types(space_dim, scalar, width)
-    search = make_search(space_dim, scalar, space.vector, on_cpu, listed)
+    search = make_search(space_dim, scalar, space.vector, on_cpu, listed, of_rows=True)
     return SimpleNamespace(
+        together=search.together,
         unscale_cotangents=unscaling_kernel(space, module, state_gradient),
-        gather_state_cotangents=state_kernel(space, module, state_gradient, search, listed),
+        gather_state_cotangents=state_kernel(space, module, state_gradient, search),
         gather_density_cotangents=density_kernel(space, module, state_gradient),
         gather_position_cotangents=position_kernel(space, module),
     )
@@ -119,39 +120,17 @@ def unscaling_kernel(space: SimpleNamespace, module: wp.Module, state_gradient: 
 
 
 def state_kernel(
-    space: SimpleNamespace, module: wp.Module, state_gradient: bool, search: Any, listed: bool
+    space: SimpleNamespace, module: wp.Module, state_gradient: bool, search: Any
 ) -> wp.Kernel:
     """Return the kernel of dL/d(states), which finds rows by `search`."""
     space_dim, scalar, width, vector = space.space_dim, space.scalar, space.width, space.vector
-    group, indices = space.group, wp.types.vector(search.stride, wp.int32)
+    group, numbers, vectors = space.group, search.numbers, search.vectors
+    together = search.together
     add_scaled = make_add_scaled(group)
     load_group, load_gradient = make_wide_load(group), make_wide_load(space.group_gradient)
+    load_index = make_wide_load(wp.int32)
 
-    @wp.func
-    def filter_rows(
-        domain: space.Domain,
-        row_positions: wp.array[vector],
-        neighbours: wp.array[wp.int32],
-        row_of: wp.array[wp.int32],
-        position: vector,
-        first: int,
-        end: int,
-    ):
-        """Return the rows within eps among a block of candidates from `first`, and their count."""
-        near = indices()
-        count = wp.int32(0)
-        if wp.static(listed):
-            for entry in range(first, wp.min(first + wp.static(search.stride), end)):
-                row = row_of[neighbours[entry]]
-                near[count] = row
-                count += wp.where(row >= 0, 1, 0)
-        else:
-            near, count = search.filter_near(
-                domain, row_positions, neighbours, position, first, end
-            )
-        return near, count
-
-    @in_ranges(PAIRS)
+    @in_ranges(PAIRS // together)
     @wp.kernel(module=module, cuda_max_registers=STATE_REGISTERS)
     def gather_state_cotangents(
         range_start: int,
@@ -181,51 +160,68 @@ def state_kernel(
 
         `flat_gradient_bar`: `gradient_bar` as scalars. With lists all arrays are in sorted order.
         """
-        k, g = wp.tid()
-        k += range_start
-        entry = particles[k]
-        position = space.position_of(entry)
-        total = group()
-        base = active_offset + (k / particle_count) * domain.cell_count
-        cell = space.cell_of(domain, position)
-        for r in range(search.run_count(domain, cell)):
-            begin, end = search.run_range(domain, starts, ends, base, cell, k, r)
-            if wp.static(not listed):
-                begin -= row_base
-                end = wp.min(end - row_base, row_capacity)
-            for first in range(begin, end, wp.static(search.stride)):
-                near, count = filter_rows(
-                    domain, row_positions, neighbours, row_of, position, first, end
-                )
-                for n in range(count):
-                    row = near[n]
-                    offset = space.minimum_image(domain, position - row_positions[row])
-                    squared = wp.dot(offset, offset)
-                    weight = smoothing(squared, domain.inverse_squared_eps, domain.smoothing_norm)
-                    smoothed = load_group(smoothed_bar, row * group_count + g)
-                    total = add_scaled(total, weight, smoothed)
-                    if wp.static(state_gradient):
-                        kernel = offset * spiky_factor(
-                            wp.sqrt(squared), domain.inverse_eps, domain.spiky_norm
+        chunk, g = wp.tid()
+        candidates = wp.zeros(shape=(wp.static(search.memory),), dtype=scalar)
+        indices = wp.zeros(shape=(wp.static(search.room),), dtype=wp.int32)
+        cursor = search.Cursor()
+        first_k = (range_start + chunk) * wp.static(together)
+        for k in range(first_k, wp.min(first_k + wp.static(together), particles.shape[0])):
+            entry = particles[k]
+            position = space.position_of(entry)
+            total = group()
+            base = active_offset + (k / particle_count) * domain.cell_count
+            cursor = search.restart(cursor)
+            while cursor.more != 0:
+                cursor = search.collect(
+                    domain, starts, ends, neighbours, row_of, row_base, row_capacity,
+                    row_positions, base, position, k, cursor, candidates, indices,
+                )  # fmt: skip
+                for first in range(0, cursor.count, wp.static(search.block)):
+                    offsets, squared = search.distances(domain, candidates, position, first)
+                    weights = numbers()
+                    kernels = vectors()
+                    c = wp.int32(0)
+                    while c < wp.static(search.block):
+                        weights[c] = smoothing(
+                            squared[c], domain.inverse_squared_eps, domain.smoothing_norm
                         )
-                        total += kernel * load_gradient(gradient_bar, row * group_count + g)
-        total = entry[wp.static(space_dim)] * total
-        i = original_index[k]
-        row = row_of[i]
-        for c in range(wp.static(width)):
-            channel = g * wp.static(width) + c
-            if channel < state_dim:
-                bar = total[c]
-                if row >= 0:
-                    bar += perception_bar[row, channel]
-                    if wp.static(state_gradient):
-                        place = (row * group_count + g) * wp.static(space_dim)
-                        for d in range(wp.static(space_dim)):
-                            bar -= (
-                                row_kernel_sum[row][d]
-                                * flat_gradient_bar[(place + d) * wp.static(width) + c]
+                        if wp.static(state_gradient):
+                            factor = spiky_factor(
+                                wp.sqrt(squared[c]), domain.inverse_eps, domain.spiky_norm
                             )
-                states_bar[i, channel] = bar
+                            for d in range(wp.static(space_dim)):
+                                # From the row to this particle.
+                                kernels[d, c] = -offsets[d, c] * factor
+                        c += 1
+                    near = search.below(squared, domain.squared_eps)
+                    while near != wp.uint32(0):
+                        c = lowest_bit(near)
+                        near = near & (near - wp.uint32(1))
+                        row = load_index(indices, first + c)
+                        smoothed = load_group(smoothed_bar, row * group_count + g)
+                        total = add_scaled(total, weights[c], smoothed)
+                        if wp.static(state_gradient):
+                            kernel = vector()
+                            for d in range(wp.static(space_dim)):
+                                kernel[d] = kernels[d, c]
+                            total += kernel * load_gradient(gradient_bar, row * group_count + g)
+            total = entry[wp.static(space_dim)] * total
+            i = original_index[k]
+            own_row = row_of[i]
+            for c in range(wp.static(width)):
+                channel = g * wp.static(width) + c
+                if channel < state_dim:
+                    bar = total[c]
+                    if own_row >= 0:
+                        bar += perception_bar[own_row, channel]
+                        if wp.static(state_gradient):
+                            place = (own_row * group_count + g) * wp.static(space_dim)
+                            for d in range(wp.static(space_dim)):
+                                bar -= (
+                                    row_kernel_sum[own_row][d]
+                                    * flat_gradient_bar[(place + d) * wp.static(width) + c]
+                                )
+                    states_bar[i, channel] = bar
 
     return gather_state_cotangents
 

@@ -1,8 +1,9 @@
 """The search for neighbours: candidates in runs of cells, or a neighbour list.
 
-On a CPU candidates are filtered in blocks: the near ones are collected, and then summed. About half
-of the candidates are near, so a branch for each would often be predicted wrongly, and would keep
-the sums in memory. On CUDA a block is one candidate: a branch for each.
+On a CPU a thread serves some adjacent particles. It copies the candidates of a cell into memory of
+its own, once for all its particles in that cell. Distances, and what follows from them, are then
+computed for a block of candidates at a time, in vector registers; only the near ones are summed. On
+CUDA a thread has one particle, and a block is one candidate.
 """
 
 from types import SimpleNamespace
@@ -10,88 +11,173 @@ from types import SimpleNamespace
 import warp as wp
 
 from npa_envs.compile_lock import cached_under_lock
+from npa_envs.kernels import native_functions as native
 from npa_envs.kernels.domain import domain_types
-from npa_envs.kernels.native_functions import namespace
+from npa_envs.kernels.lanes_and_memory import make_wide_load, wide_store
 
-FILTER_BLOCK = 32
-"""Candidates of a block on a CPU."""
+BLOCK, BLOCKS, PARTICLES = 16, 16, 32
+"""On a CPU: candidates of a block, blocks of copied candidates, particles of a thread."""
+
+lowest_bit = native.function("lowest_bit", bits=wp.uint32, returns=int)
+"""The index of the lowest bit that is set."""
 
 
 @cached_under_lock()
 def make_search(
-    space_dim: int, scalar: type, entry_type: type, on_cpu: bool, listed: bool = False
+    space_dim: int,
+    scalar: type,
+    entry_type: type,
+    on_cpu: bool,
+    listed: bool = False,
+    of_rows: bool = False,
 ) -> SimpleNamespace:
     """Return the Warp functions that find the neighbours of a particle, in cells or in a list.
 
-    `entries` are sorted vectors that begin with a position. For particle k in `cell`, of the world
-    whose first cell is `base`, the first `count` of `near` are entries within eps. They are used as
+    `entries` are sorted vectors that begin with a position. A thread has a `Cursor` and the arrays
+    `candidates`, scalars [`memory`], with number e of all entries from e `room` on, and `indices`,
+    int32 [room]. For a particle k at `position`, of the world whose first cell is `base`, they are
+    used as
 
-        for r in range(run_count(domain, cell)):
-            begin, end = run_range(domain, starts, ends, base, cell, k, r)
-            for first in range(begin, end, stride):
-                near, count = filter_near(domain, entries, neighbours, position, first, end)
+        cursor = restart(cursor)
+        while cursor.more != 0:
+            cursor = collect(..., cursor, candidates, indices)
+            for first in range(0, cursor.count, block):
+                offsets, squared = distances(domain, candidates, position, first)
+                near = below(squared, domain.squared_eps)
 
-    `listed`: `neighbours` holds the neighbours of each particle, up to its `ends`.
+    `listed`: `neighbours` has the neighbours of each particle, up to its `ends`. `of_rows`: entries
+    are rows, which begin at `row_base`; those listed are found by `row_of`.
     """
     space = domain_types(space_dim, scalar)
-    vector, cell_vector, Domain = space.vector, space.cell_vector, space.Domain
-    stride = FILTER_BLOCK if on_cpu else 1
-    indices = wp.types.vector(stride, wp.int32)
+    vector, Domain = space.vector, space.Domain
+    block, together = (BLOCK, PARTICLES) if on_cpu else (1, 1)
+    capacity = BLOCK * BLOCKS if on_cpu else 1
+    # Up to a block beyond the last candidate is read.
+    room = capacity + block
+    numbers = wp.types.vector(block, scalar)
+    vectors = wp.types.matrix((space_dim, block), scalar)
+    load_entry, load_scalar = make_wide_load(entry_type), make_wide_load(scalar)
+    load_index = make_wide_load(wp.int32)
+
+    # Of the copied candidates: 1 + their cell if they are all of it, else 0, and their number; then
+    # the next run, the rest of the present one, and whether there are more candidates.
+    @wp.struct
+    class Cursor:
+        held: int
+        count: int
+        run: int
+        begin: int
+        end: int
+        more: int
 
     @wp.func
-    def run_count(domain: Domain, cell: cell_vector):
-        """Return the number of runs of cells around a cell; with neighbour lists 1."""
-        count = wp.int32(1)
-        if wp.static(not listed):
-            count = space.segment_count(domain, cell)
-        return count
+    def restart(cursor: Cursor):
+        """Return the cursor at the beginning of a particle's candidates."""
+        cursor.run = 0
+        cursor.begin = 0
+        cursor.end = 0
+        cursor.more = 1
+        return cursor
 
     @wp.func
-    def run_range(
+    def collect(
         domain: Domain,
         starts: wp.array[wp.int32],
         ends: wp.array[wp.int32],
+        neighbours: wp.array[wp.int32],
+        row_of: wp.array[wp.int32],
+        row_base: int,
+        row_capacity: int,
+        entries: wp.array[entry_type],
         base: int,
-        cell: cell_vector,
+        position: vector,
         k: int,
-        r: int,
+        cursor: Cursor,
+        # outputs
+        candidates: wp.array[scalar],
+        indices: wp.array[wp.int32],
     ):
-        """Return k's first and last + 1 candidate in run r; `base`: first cell of its world."""
-        begin = wp.int32(0)
-        end = wp.int32(0)
-        if wp.static(listed):
-            if k > 0:
-                begin = ends[k - 1]
-            end = ends[k]
-        else:
-            first, last = space.segment_cells(domain, cell, r)
-            begin = starts[base + first]
-            end = starts[base + last]
-        return begin, end
+        """Copy the next candidates, as many as there is room for; return the cursor behind them.
+
+        Nothing is copied if the last particle had the same cell, and all its candidates fitted.
+        """
+        cell = space.cell_of(domain, position)
+        label = base + space.cell_index(domain, cell) + 1
+        cursor.more = 0
+        if label == cursor.held:
+            return cursor
+        runs = wp.int32(1)
+        if wp.static(not listed):
+            runs = space.segment_count(domain, cell)
+        run = cursor.run
+        begin = cursor.begin
+        end = cursor.end
+        count = wp.int32(0)
+        while count < wp.static(capacity) and (begin < end or run < runs):
+            if begin >= end:
+                if wp.static(listed):
+                    if k > 0:
+                        begin = ends[k - 1]
+                    end = ends[k]
+                else:
+                    first, last = space.segment_cells(domain, cell, run)
+                    begin = starts[base + first]
+                    end = starts[base + last]
+                    if wp.static(of_rows):
+                        begin -= row_base
+                        end = wp.min(end - row_base, row_capacity)
+                run += 1
+            stop = wp.min(end, begin + wp.static(capacity) - count)
+            while begin < stop:
+                index = begin
+                if wp.static(listed):
+                    index = load_index(neighbours, begin)
+                kept = wp.int32(1)
+                if wp.static(listed and of_rows):
+                    kept = wp.where(row_of[index] >= 0, 1, 0)
+                    index = wp.max(row_of[index], 0)
+                entry = load_entry(entries, index)
+                for e in range(wp.static(entry_type._length_)):
+                    wide_store(candidates, wp.static(e * room) + count, entry[e])
+                wide_store(indices, count, index)
+                count += kept
+                begin += 1
+        # A distance that is NaN is not near.
+        c = wp.int32(0)
+        while c < wp.static(block):
+            wide_store(candidates, count + c, scalar(wp.static(wp.nan)))
+            c += 1
+        whole = cursor.run == 0 and begin >= end and run >= runs
+        cursor.held = wp.where(wp.static(on_cpu and not listed) and whole, label, 0)
+        cursor.count = count
+        cursor.run = run
+        cursor.begin = begin
+        cursor.end = end
+        cursor.more = wp.where(begin < end or run < runs, 1, 0)
+        return cursor
 
     @wp.func
-    def filter_near(
-        domain: Domain,
-        entries: wp.array[entry_type],
-        neighbours: wp.array[wp.int32],
-        position: vector,
-        first: int,
-        end: int,
-    ):
-        """Return the candidates within eps in the block from `first` on, and their count."""
-        near = indices()
-        count = wp.int32(0)
-        for c in range(first, wp.min(first + wp.static(stride), end)):
-            if wp.static(listed):
-                near[count] = neighbours[c]
-                count += 1
-            else:
-                near[count] = c
-                offset = vector()
-                for d in range(wp.static(space_dim)):
-                    offset[d] = entries[c][d] - position[d]
-                offset = space.minimum_image(domain, offset)
-                count += wp.where(wp.dot(offset, offset) < domain.squared_eps, 1, 0)
-        return near, count
+    def distances(domain: Domain, candidates: wp.array[scalar], position: vector, first: int):
+        """Return offsets [D, block] of candidates from `first` on, and their squared lengths."""
+        offsets = vectors()
+        squared = numbers()
+        c = wp.int32(0)
+        while c < wp.static(block):
+            # Not as a vector: the compiler would not compute several candidates together.
+            sum = scalar(0.0)
+            for d in range(wp.static(space_dim)):
+                offset = load_scalar(candidates, wp.static(d * room) + first + c) - position[d]
+                if domain.periodic != 0:
+                    offset = space.periodic_image_along(domain, d, offset)
+                offsets[d, c] = offset
+                sum += offset * offset
+            squared[c] = sum
+            c += 1
+        return offsets, squared
 
-    return namespace(locals(), stride=stride)
+    below = native.function("bits_below", values=numbers, limit=scalar, returns=wp.uint32)
+    """A number with a bit for each value of a block: whether it is below a limit."""
+
+    types = {"numbers": numbers, "vectors": vectors, "Cursor": Cursor}
+    memory = {"memory": entry_type._length_ * room, "room": room}
+    return native.namespace(locals(), block=block, together=together, **types, **memory)

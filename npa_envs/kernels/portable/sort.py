@@ -12,6 +12,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from npa_envs.compile_lock import cached_under_lock
+from npa_envs.kernels import native_functions as native
 from npa_envs.kernels.domain import domain_types, kernel_module
 from npa_envs.kernels.lanes_and_memory import (
     load_integer,
@@ -20,6 +21,9 @@ from npa_envs.kernels.lanes_and_memory import (
     wide_store,
 )
 from npa_envs.kernels.native_functions import PARTICLES, WORLDS, in_ranges, namespace
+
+sum_of_first = native.function("sum_of_first", values=wp.array[wp.uint8], count=int, returns=int)
+"""The sum of the first `count` values of a contiguous array."""
 
 
 @cached_under_lock()
@@ -164,8 +168,7 @@ def sort_kernels(space_dim: int, scalar: type, width: int) -> SimpleNamespace:
         first_row = row_base
         masked = mask.shape[0] > 0
         if masked:
-            for i in range(first):
-                first_row += wp.int32(mask[i])
+            first_row += sum_of_first(mask, first)
         for c in range(first_cell, end_cell):
             starts[c] = 0
             if masked:

@@ -66,7 +66,7 @@ def motion_functions(space_dim: int, scalar: type) -> SimpleNamespace:
 
 
 @cached_under_lock()
-def update_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
+def update_kernels(space_dim: int, scalar: type, on_cpu: bool) -> SimpleNamespace:
     """Return `apply_update`, which moves particles and changes states, and its backward kernel."""
     space = domain_types(space_dim, scalar)
     vector, vector_f64 = space.vector, space.vector_f64
@@ -75,9 +75,9 @@ def update_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
     load_scalar = make_wide_load(scalar)
     read_states = make_read_at(channels, 16)
     read_change = make_read_at(channels, UPDATE_ALIGNMENT[space_dim])
-    module = kernel_module("update", space_dim, scalar)
+    module = kernel_module("update", space_dim, scalar, on_cpu=on_cpu)
 
-    @in_ranges(ELEMENTS)
+    @in_ranges(ELEMENTS // MOVED_TOGETHER if on_cpu else ELEMENTS)
     @wp.kernel(module=module)
     def apply_update(
         range_start: int,
@@ -102,54 +102,61 @@ def update_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
         """Write new positions, states and path lengths; a particle without a row keeps its own."""
         wait_for_previous_kernel()
         # Of the threads of a group of particles, the first move one particle each, and the others
-        # change some channels each.
+        # change some channels each. On a CPU, which divides slowly, a thread has the whole group.
         chunks = (state_dim + wp.static(THREAD_CHANNELS - 1)) / wp.static(THREAD_CHANNELS)
         t = range_start + wp.tid()
-        group = t / (wp.static(MOVED_TOGETHER) * (1 + chunks))
-        thread = t - group * (wp.static(MOVED_TOGETHER) * (1 + chunks))
-        i = group * wp.static(MOVED_TOGETHER) + thread
-        first = wp.int32(-1)
-        if thread >= wp.static(MOVED_TOGETHER):
-            channel_thread = thread - wp.static(MOVED_TOGETHER)
-            member = channel_thread / chunks
-            i = group * wp.static(MOVED_TOGETHER) + member
-            first = (channel_thread - member * chunks) * wp.static(THREAD_CHANNELS)
-        if i >= positions.shape[0]:
-            return
-        row = load_integer(row_of, i)
-        row_begin = row * update_width
-        if first < 0:
-            position = positions[i]
-            path = path_length[i]
-            if row >= 0 and moving != 0:
-                delta = vector_f64()
-                for d in range(wp.static(space_dim)):
-                    delta[d] = wp.float64(load_scalar(update, row_begin + d))
-                length = wp.length(delta)
-                step = largest_step / (wp.float64(1.0) + length)
-                position = motion.displaced(position, step, delta)
-                path += scalar(step * length)
-            position = motion.bounded(position, boundary, box)
-            new_positions[i] = position
-            new_path_length[i] = path
-        else:
-            states_begin = i * state_dim + first
-            change_begin = row_begin + first
-            if moving != 0:
-                change_begin += wp.static(space_dim)
-            if aligned != 0:
-                state = read_states(states, states_begin)
-                if row >= 0:
-                    change = read_change(update, change_begin)
-                    for k in range(wp.static(THREAD_CHANNELS)):
-                        state[k] += dt * change[k]
-                write_at(new_states, states_begin, state)
-            else:
-                for k in range(wp.min(wp.static(THREAD_CHANNELS), state_dim - first)):
-                    value = states[states_begin + k]
-                    if row >= 0:
-                        value += dt * update[change_begin + k]
-                    new_states[states_begin + k] = value
+        begin = t * wp.static(MOVED_TOGETHER)
+        count = wp.int32(MOVED_TOGETHER)
+        first_part = wp.int32(0)
+        parts = 1 + chunks
+        if wp.static(not on_cpu):
+            group = t / (wp.static(MOVED_TOGETHER) * (1 + chunks))
+            thread = t - group * (wp.static(MOVED_TOGETHER) * (1 + chunks))
+            begin = group * wp.static(MOVED_TOGETHER) + thread
+            if thread >= wp.static(MOVED_TOGETHER):
+                channel_thread = thread - wp.static(MOVED_TOGETHER)
+                member = channel_thread / chunks
+                begin = group * wp.static(MOVED_TOGETHER) + member
+                first_part = 1 + channel_thread - member * chunks
+            count = wp.int32(1)
+            parts = wp.int32(1)
+        for i in range(begin, wp.min(begin + count, positions.shape[0])):
+            row = load_integer(row_of, i)
+            row_begin = row * update_width
+            for part in range(first_part, first_part + parts):
+                if part == 0:
+                    position = positions[i]
+                    path = path_length[i]
+                    if row >= 0 and moving != 0:
+                        delta = vector_f64()
+                        for d in range(wp.static(space_dim)):
+                            delta[d] = wp.float64(load_scalar(update, row_begin + d))
+                        length = wp.length(delta)
+                        step = largest_step / (wp.float64(1.0) + length)
+                        position = motion.displaced(position, step, delta)
+                        path += scalar(step * length)
+                    position = motion.bounded(position, boundary, box)
+                    new_positions[i] = position
+                    new_path_length[i] = path
+                else:
+                    first = (part - 1) * wp.static(THREAD_CHANNELS)
+                    states_begin = i * state_dim + first
+                    change_begin = row_begin + first
+                    if moving != 0:
+                        change_begin += wp.static(space_dim)
+                    if aligned != 0:
+                        state = read_states(states, states_begin)
+                        if row >= 0:
+                            change = read_change(update, change_begin)
+                            for k in range(wp.static(THREAD_CHANNELS)):
+                                state[k] += dt * change[k]
+                        write_at(new_states, states_begin, state)
+                    else:
+                        for k in range(wp.min(wp.static(THREAD_CHANNELS), state_dim - first)):
+                            value = states[states_begin + k]
+                            if row >= 0:
+                                value += dt * update[change_begin + k]
+                            new_states[states_begin + k] = value
 
     @in_ranges(ELEMENTS)
     @wp.kernel(module=module)
