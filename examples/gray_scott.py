@@ -88,10 +88,11 @@ def picture(x, s, eps):
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--steps", type=int, default=480, help="of ten units of time each")
+    parser.add_argument("--particles", type=int, default=8192, help="more: a larger world")
     parser.add_argument("--film", type=Path, default=Path("gray_scott.webp"), help="to write")
     given = parser.parse_args()
     torch.set_num_threads(1)  # small worlds; a busy machine does not slow them down
-    x, s, eps = start(8192, torch.Generator().manual_seed(0))
+    x, s, eps = start(given.particles, torch.Generator().manual_seed(0))
     frames = [picture(x, s, eps)]
     for k in range(given.steps):
         x, s = step(x, s, eps)

@@ -1,7 +1,7 @@
 """Particle Life: six kinds of particles that attract or flee each other build cells that swim.
 
     pip install npa-envs
-    python examples/particle_life.py  # 20 s; writes particle_life.webp
+    python examples/particle_life.py  # 10 s; writes particle_life.webp
 
 The force is that of T. Mohr (particle-life.com, after J. Ventrella's Clusters). At a distance r, in
 units of `RADIUS`, all repel each other below β by 1 - r/β; from β to 1 kind a is drawn to kind b by

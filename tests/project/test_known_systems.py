@@ -32,6 +32,14 @@ def test_birds_that_see_each_other_fly_one_way_by_alignment_alone():
         assert low < boids["polarisation"](velocity) < high + 1e-6
 
 
+@pytest.mark.parametrize(("distance", "comes_nearer"), [(0.03, False), (0.1, True)])
+def test_two_birds_come_together_but_not_too_near(distance, comes_nearer):
+    boids, _ = program("boids")
+    x = torch.tensor([[[0.0, 0.0], [distance, 0.0]]])
+    x, _ = boids["step"](x, torch.tensor([[[0.0, 0.006], [0.0, 0.006]]]))
+    assert (x[0, 1, 0] - x[0, 0, 0] < distance) == comes_nearer
+
+
 def test_a_wave_on_stirred_particles_decays_as_diffusion_does_and_loses_nothing():
     gray_scott, generator = program("gray_scott")
     x, s, eps = gray_scott["start"](1024, generator)
@@ -79,12 +87,12 @@ def test_particle_life_has_the_published_force_up_to_the_rounding_of_float32():
     assert life["force"](x, table + table.T).sum(dim=1).norm() < 1e-5, "action is reaction"
 
 
-@pytest.mark.parametrize("name", ["boids", "gray_scott", "particle_life"])
-def test_a_known_system_writes_its_film(name, tmp_path, monkeypatch):
+@pytest.mark.parametrize("words", ["boids", "gray_scott --particles 1024", "particle_life"])
+def test_a_known_system_writes_its_film(words, tmp_path, monkeypatch):
     film = tmp_path / "film.webp"
-    monkeypatch.setattr(sys, "argv", [name, "--steps", "8", "--film", str(film)])
+    monkeypatch.setattr(sys, "argv", [*words.split(), "--steps", "8", "--film", str(film)])
     threads = torch.get_num_threads()
-    runpy.run_path(str(EXAMPLES / f"{name}.py"), run_name="__main__")
+    runpy.run_path(str(EXAMPLES / f"{sys.argv[0]}.py"), run_name="__main__")
     torch.set_num_threads(threads)
     frames = imageio.imread(film, index=...)
     assert len(frames) > 1
