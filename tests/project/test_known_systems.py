@@ -92,7 +92,9 @@ def test_a_known_system_writes_its_film(words, tmp_path, monkeypatch):
     film = tmp_path / "film.webp"
     monkeypatch.setattr(sys, "argv", [*words.split(), "--steps", "8", "--film", str(film)])
     threads = torch.get_num_threads()
-    runpy.run_path(str(EXAMPLES / f"{sys.argv[0]}.py"), run_name="__main__")
+    path = EXAMPLES / f"{sys.argv[0]}.py"
+    assert len(path.read_text(encoding="utf-8").splitlines()) <= 120
+    runpy.run_path(str(path), run_name="__main__")
     torch.set_num_threads(threads)
     frames = imageio.imread(film, index=...)
     assert len(frames) > 1
