@@ -18,7 +18,7 @@ from torch.autograd import forward_ad
 from torch.utils._python_dispatch import is_in_torch_dispatch_mode
 
 from npa_envs.errors import NPAError
-from npa_envs.ops.launch import tracing
+from npa_envs.ops.launch import repeated, tracing
 from npa_envs.ops.physics import Physics
 
 Arguments = ParamSpec("Arguments")
@@ -87,7 +87,8 @@ class CustomOp(Generic[Arguments, Result]):
     """A function of tensors that is called directly, or as a torch operator where torch needs one.
 
     It needs one under torch.compile, in dispatch modes and for tensor subclasses. Elsewhere an
-    operator's call would cost as much CPU time as several launches. Arguments are positional.
+    operator's call would cost as much CPU time as several launches, and later calls repeat the
+    launches of earlier ones (`npa_envs.ops.launch.repeated`). Arguments are positional.
     Results share no memory with each other or with arguments. The operator takes a `Physics` as the
     list `Physics.numbers`. With torch's fake tensors, which have no memory, nothing is launched.
     """
@@ -130,7 +131,8 @@ class CustomOp(Generic[Arguments, Result]):
             flat = [value.numbers() if isinstance(value, Physics) else value for value in args]
             result: Result = self._operator(*flat)
             return result
-        return self._function(*args, **kwargs)
+        made: Result = repeated(self._function, args)
+        return made
 
 
 def custom_op(name: str) -> Callable[[Callable[Arguments, Result]], CustomOp[Arguments, Result]]:

@@ -1,28 +1,33 @@
 """Launches of Warp kernels on tensors, on torch's current stream or on CPU threads.
 
-There are three ways to launch a kernel, each with less CPU time than the one before:
+There are four ways to launch a kernel, each with less CPU time than the one before:
 
 - The first `launch` of a kernel on a device has Warp compile and load the kernel and pack its
   arguments. The thread keeps the result, a `_PreparedLaunch`.
 - Each later `launch` of it overwrites the arguments that changed, and repeats the prepared launch.
 - `RecordedLaunches` keeps a sequence of prepared launches, each with arguments of its own, and
   replays them. Between replays only the addresses of chosen tensors can be changed.
+- `repeated` does so for a whole operator: from the third call with tensors of the same forms on, it
+  allocates results, and one block of memory for all other tensors, and repeats the launches.
 """
 
 from __future__ import annotations
 
+import collections
 import contextlib
 import ctypes
 import functools
 import inspect
+import itertools
 import math
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Hashable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import torch
 import warp as wp
-from torch import Tensor
+from torch import Tensor, nn
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from npa_envs.compile_lock import cached_under_lock, kernel_lock
 from npa_envs.errors import NPAError
@@ -65,6 +70,8 @@ class _ThreadState(threading.local):
         """Sequence to which this thread's launches are appended; None: they are not recorded."""
         self.traced = False
         """Whether tensors have no memory, so that nothing is launched."""
+        self.calls: collections.OrderedDict[Hashable, _Calls] = collections.OrderedDict()
+        """Operators' calls by function and forms of arguments, the least recently used first."""
 
 
 _thread = _ThreadState()
@@ -118,8 +125,12 @@ def is_traced() -> bool:
     return _thread.traced
 
 
-def is_aligned(tensor: Tensor, size: int = 16) -> bool:
-    """Return whether a tensor begins at a multiple of `size` bytes in memory."""
+ALIGNED_BYTES = 16
+"""Largest alignment of tensors that a choice of kernels depends on [bytes]."""
+
+
+def is_aligned(tensor: Tensor, size: int = ALIGNED_BYTES) -> bool:
+    """Return whether a tensor begins at a multiple of `size` bytes, at most `ALIGNED_BYTES`."""
     return _thread.traced or tensor.data_ptr() % size == 0
 
 
@@ -207,6 +218,11 @@ class _PreparedLaunch:
                 declared = self._warp_launch.kernel.adj.args[k].type
                 number = declared(*value) if isinstance(value, tuple) else value
                 setattr(self._memory, self._names[k], number)
+
+    def address_of(self, index: int) -> Any:
+        """Return the C number that is the address of an array argument's tensor, to overwrite."""
+        descriptor = getattr(self._memory, self._names[index])
+        return ctypes.c_uint64.from_buffer(descriptor, type(descriptor).data.offset)
 
     def set_address(self, index: int, tensor: Tensor) -> None:
         """Point an array argument at another tensor of the same shape and dtype."""
@@ -365,11 +381,6 @@ class _StructArgument:
             self._last = value
 
 
-def is_recording() -> bool:
-    """Return whether this thread records its launches."""
-    return _thread.recording is not None
-
-
 class RecordedLaunches:
     """A sequence of launches to replay with the same arguments, but for tensors that are moved."""
 
@@ -408,6 +419,17 @@ class RecordedLaunches:
         """Return the number of launches."""
         return len(self._launches)
 
+    def steps(self) -> list[tuple[_PreparedLaunch, tuple[int, ...]]]:
+        """Return all launches and their sizes."""
+        return self._launches
+
+    def tensors(self) -> Iterator[tuple[Any, Tensor]]:
+        """Yield each tensor that is not empty, with the number that is its address in arguments."""
+        for (prepared, _), arguments in zip(self._launches, self._tensors, strict=True):
+            for k, value in enumerate(arguments):
+                if isinstance(value, Tensor) and value.numel():
+                    yield prepared.address_of(k), value
+
     def argument_slots(self, tensor: Tensor) -> list[tuple[_PreparedLaunch, int]]:
         """Return launches and indices whose argument is `tensor`, which the caller keeps alive."""
         slots, address = [], tensor.data_ptr()
@@ -432,6 +454,141 @@ class RecordedLaunches:
             prepared.run(size)
         prepared, size = launches[-1]
         prepared.run(size if last_count is None else (last_count, *size[1:]))
+
+
+class _Calls:
+    """The calls of an operator with arguments of the same forms, in one thread."""
+
+    def __init__(self) -> None:
+        self.count = 0
+        self.repeat: _Repeat | None = None
+        """Its launches; None: they are not recorded yet, or cannot be repeated."""
+
+
+MAX_REPEATED = 128
+"""Maximum number of kinds of operator calls that a thread counts."""
+
+CALLED_FIRST = 2
+"""Number of calls of a kind before its launches are recorded."""
+
+ALIGNMENT = 512
+"""Alignment of tensors within a block of memory [bytes], that of torch's allocators."""
+
+
+def repeated(function: Callable[..., Any], arguments: Sequence[Any]) -> Any:
+    """Return `function(*arguments)`, from the third call of a kind on by repeating its launches.
+
+    The function allocates and launches. All else that it does must follow from numbers in the
+    arguments, and from the tensors' shapes, dtypes, devices and alignment. If it calls any other
+    operator of torch, it is always called. Results are new tensors in each call.
+    """
+    if _thread.traced or _thread.recording is not None or _observers:
+        return function(*arguments)
+    tensors: list[Tensor] = []
+    key: list[Hashable] = [function]
+    for argument in arguments:
+        several = type(argument) is list
+        for value in argument if several else (argument,):
+            if isinstance(value, Tensor):
+                if type(value) not in (Tensor, nn.Parameter) or not value.is_contiguous():
+                    return function(*arguments)
+                tensors.append(value)
+                place = value.data_ptr() % ALIGNED_BYTES
+                key += (value.shape, value.dtype, value.device, place)
+            else:
+                key.append(value)
+        key.append(several)
+    of_thread, kind = _thread.calls, tuple(key)
+    calls = of_thread.get(kind)
+    if calls is None:
+        calls = of_thread[kind] = _Calls()
+        if len(of_thread) > MAX_REPEATED:
+            of_thread.popitem(last=False)
+    else:
+        of_thread.move_to_end(kind)
+    if calls.repeat is not None:
+        return calls.repeat.run(tensors)
+    calls.count += 1
+    if calls.count != 1 + CALLED_FIRST:
+        return function(*arguments)
+    recorded, watch = RecordedLaunches(), _WatchedOperators()
+    with recorded.recording(), watch:
+        results = function(*arguments)
+    if watch.only_allocates:
+        with contextlib.suppress(LookupError):
+            calls.repeat = _Repeat(recorded, tensors, results)
+    return results
+
+
+class _WatchedOperators(TorchDispatchMode):
+    """Notes whether torch's operators in the block only allocate memory and make views."""
+
+    only_allocates = True
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        """Run an operator of torch."""
+        allocates = func.name().startswith(("aten::empty", "aten::new_empty"))
+        self.only_allocates &= allocates or func.is_view
+        return func(*args, **(kwargs or {}))
+
+
+class _Repeat:
+    """The launches of an operator's call, to repeat with other tensors of the same forms.
+
+    Raises LookupError if the memory of two of the call's tensors overlaps.
+    """
+
+    def __init__(
+        self, recorded: RecordedLaunches, inputs: Sequence[Tensor], results: Any
+    ) -> None:
+        self._several = None if isinstance(results, Tensor) else type(results)
+        made: list[Tensor] = [results] if self._several is None else [*results]
+        self._forms = [(each.shape, each.dtype, each.device) for each in made]
+        self._launches = [(prepared.run, size) for prepared, size in recorded.steps()]
+        self._addresses: list[tuple[Any, int, int]] = []
+        """Addresses in arguments, each with the index of a result or input, and a distance [bytes]
+        from its begin; the index after the last is that of the block for all other tensors."""
+        owners = [*made, *inputs]
+        regions = [(owner.data_ptr(), owner.nbytes) for owner in owners if owner.nbytes]
+        ordered = sorted(regions)
+        if any(a + size > b for (a, size), (b, _) in itertools.pairwise(ordered)):
+            raise LookupError("arguments share memory")
+        places: dict[int, int] = {}
+        self._block_bytes = 0
+        for address_of, tensor in recorded.tensors():
+            begin = tensor.data_ptr()
+            extents = zip(tensor.shape, tensor.stride(), strict=True)
+            last = sum((size - 1) * stride for size, stride in extents)
+            end = begin + (last + 1) * tensor.itemsize
+            for index, owner in enumerate(owners):
+                distance = begin - owner.data_ptr()
+                if 0 <= distance < owner.nbytes:
+                    if end > begin - distance + owner.nbytes:
+                        raise LookupError("an argument is larger than the tensor that it is of")
+                    break
+            else:
+                storage = tensor.untyped_storage()
+                index, whole = len(owners), storage.data_ptr()
+                if whole not in places:
+                    places[whole] = self._block_bytes
+                    self._block_bytes += -(-storage.nbytes() // ALIGNMENT) * ALIGNMENT
+                distance = places[whole] + begin - whole
+            self._addresses.append((address_of, index, distance))
+
+    def run(self, inputs: Sequence[Tensor]) -> Any:
+        """Return the operator's results for other tensors."""
+        made = [torch.empty(shape, dtype=dtype, device=on) for shape, dtype, on in self._forms]
+        begins = [tensor.data_ptr() for tensor in made]
+        begins += [tensor.data_ptr() for tensor in inputs]
+        if self._block_bytes:
+            device = inputs[0].device
+            block = torch.empty(self._block_bytes, dtype=torch.uint8, device=device)
+            begins.append(block.data_ptr())
+        for address, index, distance in self._addresses:
+            address.value = begins[index] + distance
+        for run, size in self._launches:
+            run(size)
+        return made[0] if self._several is None else self._several(made)
 
 
 class NotedLaunch(NamedTuple):
