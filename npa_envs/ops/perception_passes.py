@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+import math
 from typing import Any, NamedTuple
 
 import torch
@@ -18,7 +20,7 @@ from npa_envs.kernels.portable.density import density_kernels
 from npa_envs.kernels.portable.perceive import perception_kernels
 from npa_envs.ops.backend import ListLayout
 from npa_envs.ops.custom_op import custom_op
-from npa_envs.ops.launch import launch
+from npa_envs.ops.launch import ALIGNMENT, launch
 from npa_envs.ops.physics import Physics
 from npa_envs.ops.sort import MAX_INDEX, KernelPlan, SortedWorlds, plan_kernels
 
@@ -80,17 +82,20 @@ def compute_densities(
     *,
     state_index: Tensor | None = None,
     with_particles: bool = True,
+    particles: Tensor | None = None,
 ) -> Densities:
     """Return densities, with neighbour lists (CUDA) or density gradients (elsewhere).
 
     `state_index` is the index of each sorted particle's state, int32, shape [B N]; None: states are
-    sorted too. `with_particles`: also return `Densities.particles` on CUDA, for the adjoint.
+    sorted too. `with_particles`: also return `Densities.particles` on CUDA, for the adjoint, in the
+    tensor `particles`, or a new one.
     """
     if not plan.lists_neighbours:
-        return compute_densities_in_cells(plan, ordered)
+        return compute_densities_in_cells(plan, ordered, particles)
     layout, positions = plan.list_layout, ordered.positions
     records = positions.new_empty(plan.total, 4)
-    particles = positions.new_empty(plan.total if with_particles else 0, plan.space_dim + 1)
+    if particles is None:
+        particles = positions.new_empty(plan.total if with_particles else 0, plan.space_dim + 1)
     list_shape = -(-plan.row_capacity // INTERLEAVED_LISTS), layout.capacity, INTERLEAVED_LISTS
     differences = positions.new_empty(list_shape, dtype=torch.int16)
     lengths = positions.new_empty(plan.row_capacity, dtype=torch.int32)
@@ -122,10 +127,13 @@ def compute_densities(
     return Densities(particles, no_gradient, NeighbourLists(layout, differences, lengths, records))
 
 
-def compute_densities_in_cells(plan: KernelPlan, ordered: SortedWorlds) -> Densities:
+def compute_densities_in_cells(
+    plan: KernelPlan, ordered: SortedWorlds, particles: Tensor | None = None
+) -> Densities:
     """Return densities of all particles and density gradients of active ones; makes no lists."""
     positions = ordered.positions
-    particles = positions.new_empty(plan.total, plan.space_dim + 1)
+    if particles is None:
+        particles = positions.new_empty(plan.total, plan.space_dim + 1)
     density_gradient = positions.new_empty(plan.total, plan.space_dim, dtype=torch.float64)
     launch(
         density_kernels(plan.space_dim, plan.scalar, plan.on_cpu).compute_density,
@@ -154,6 +162,7 @@ def perception_launch(
     destination: Tensor | None = None,
     limit: float = 0.0,
     row_kernel_sum: Tensor | None = None,
+    rows_out: Tensor | None = None,
     first_row: int = 0,
     row_count: int | None = None,
 ) -> tuple[Any, ...]:
@@ -164,6 +173,7 @@ def perception_launch(
         destination: Row of `out` for each active particle, int32, shape [K]; None: in their order.
         limit: Entries are clipped to plus and minus this; 0: not clipped.
         row_kernel_sum: Output: sums over neighbours of volume times kernel gradient, shape [K, D].
+        rows_out: Output: what the adjoint reads of the vectors, in their order, shape [K, P].
         first_row: First active particle to write, a multiple of `INTERLEAVED_LISTS`.
         row_count: Number of active particles to write, one after the other; None: all.
     """
@@ -175,7 +185,8 @@ def perception_launch(
         if lists is not None:
             differences = lists.index_differences[first_row // INTERLEAVED_LISTS :]
             lists = lists._replace(index_differences=differences, lengths=lists.lengths[first_row:])
-    group_count, rows, outputs = plan.group_count, (row_index, destination), (out, row_kernel_sum)
+    group_count, rows = plan.group_count, (row_index, destination)
+    outputs = out, row_kernel_sum, rows_out
     numbers = (
         plan.state_dim,
         int(plan.physics.terms.density_gradient),
@@ -203,6 +214,7 @@ def perception_launch(
             *outputs,
         )
     variant = _perception_variant(plan, lists, group_count > 1, row_kernel_sum is not None)
+    variant = variant._replace(twice=rows_out is not None)
     cells = ordered.starts, ordered.cell, ordered.positions, lists.records
     return (
         listed_perception(variant),
@@ -259,6 +271,53 @@ class SavedPerception(NamedTuple):
     """Of `SortedWorlds`; None where positions get no gradient."""
 
 
+def saved_together(
+    plan: KernelPlan, like: Tensor, with_states: bool, block: Tensor | None = None
+) -> tuple[Tensor, SavedPerception]:
+    """Return a `SavedPerception` of all particles within one block of bytes, and the block.
+
+    `block` None: a new one. `like` is a tensor of the worlds' dtype and device.
+    """
+    total, dims = plan.total, plan.space_dim
+    width = plan.physics.terms.perception_dim(dims, plan.state_dim)
+    shapes = {"perception": (total, width), "row_kernel_sum": (total, dims)}
+    shapes |= {"row_positions": (total, dims), "particles": (total, dims + 1)}
+    shapes |= {"states": (total * plan.group_count, plan.width)} if with_states else {}
+    indices = {"row_of": (total,), "starts": (plan.start_count,), "original_index": (total,)}
+    forms = [(name, shape, like.dtype) for name, shape in shapes.items()]
+    forms += [(name, shape, torch.int32) for name, shape in indices.items()]
+    sizes = [math.prod(shape) * dtype.itemsize for _, shape, dtype in forms]
+    ends = [*itertools.accumulate(-(-size // ALIGNMENT) * ALIGNMENT for size in sizes)]
+    if block is None:
+        block = torch.empty(ends[-1], dtype=torch.uint8, device=like.device)
+    parts = {
+        name: block[begin : begin + size].view(dtype).view(shape)
+        for (name, shape, dtype), begin, size in zip(forms, (0, *ends), sizes, strict=False)
+    }
+    return block, SavedPerception(**parts)
+
+
+@custom_op("npa::perceive_backward")
+def perceive_backward(
+    perception_bar: Tensor,
+    block: Tensor,
+    space_dim: int,
+    state_dim: int,
+    with_positions: bool,
+    physics: Physics,
+) -> tuple[Tensor, Tensor]:
+    """Return gradients as `perceive_rows_backward`, from that of every particle, [B, N, P].
+
+    `block` is that of `saved_together`.
+    """
+    world_count, particle_count, width = map(int, perception_bar.shape)
+    shape, total = (world_count, particle_count, space_dim), world_count * particle_count
+    plan = plan_kernels(perception_bar, shape, state_dim, total, False, physics)
+    _, saved = saved_together(plan, perception_bar, with_positions, block)
+    bar = perception_bar.view(total, width)
+    return _pull_back(plan, saved, [], bar, saved.original_index)
+
+
 @custom_op("npa::perceive_rows_backward")
 def perceive_rows_backward(
     perception_bar: Tensor,
@@ -284,15 +343,32 @@ def perceive_rows_backward(
         masked,
         physics,
     )
-    bar = perception_bar.contiguous()
+    return _pull_back(plan, saved, static_neighbours, perception_bar.contiguous(), None)
+
+
+def _pull_back(
+    plan: KernelPlan,
+    saved: SavedPerception,
+    static_neighbours: list[Tensor],
+    bar: Tensor,
+    bar_row: Tensor | None,
+) -> tuple[Tensor, Tensor]:
+    """Return both gradients of `perceive_rows_backward`.
+
+    `bar_row` is the row of `bar` of each row, that of its particle; None: rows are in their order.
+    """
     if plan.runs("adjoint", position_gradient=saved.states is not None) == "cuda":
-        states_bar = _gather_by_tiles(plan, saved, bar)
+        states_bar = _gather_by_tiles(plan, saved, bar, bar_row)
         return states_bar, states_bar.new_empty(0)
-    return _gather_by_cells(plan, saved, static_neighbours, bar)
+    return _gather_by_cells(plan, saved, static_neighbours, bar, bar_row)
 
 
 def _gather_by_cells(
-    plan: KernelPlan, saved: SavedPerception, static_neighbours: list[Tensor], bar: Tensor
+    plan: KernelPlan,
+    saved: SavedPerception,
+    static_neighbours: list[Tensor],
+    bar: Tensor,
+    bar_row: Tensor | None,
 ) -> tuple[Tensor, Tensor]:
     """Return both gradients of `perceive_rows_backward`, with the portable kernels."""
     neighbours, ends = static_neighbours or (None, None)
@@ -306,7 +382,7 @@ def _gather_by_cells(
         terms.state_gradient,
         bool(static_neighbours),
     )
-    row_bars = _unscaled_cotangents(plan, saved, kernels, bar)
+    row_bars = _unscaled_cotangents(plan, saved, kernels, bar, bar_row)
     smoothed_bar, gradient_bar, _ = row_bars
     states_bar = bar.new_empty(plan.total, plan.state_dim)
     cells = saved.starts, ends, neighbours, saved.particles, saved.original_index
@@ -323,6 +399,7 @@ def _gather_by_cells(
         *cells,
         *rows,
         bar,
+        bar_row,
         smoothed_bar,
         # Twice: in the kernel's matrices, and as its flat array of numbers.
         gradient_bar,
@@ -342,7 +419,7 @@ def _gather_by_cells(
 
 
 def _unscaled_cotangents(
-    plan: KernelPlan, saved: SavedPerception, kernels: Any, bar: Tensor
+    plan: KernelPlan, saved: SavedPerception, kernels: Any, bar: Tensor, bar_row: Tensor | None
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Return gradients of each row's smoothed states, state gradients and density gradients.
 
@@ -374,6 +451,7 @@ def _unscaled_cotangents(
         saved.starts,
         saved.perception,
         bar,
+        bar_row,
         smoothed_bar,
         gradient_bar,
         density_gradient_bar,
@@ -381,7 +459,9 @@ def _unscaled_cotangents(
     return smoothed_bar, gradient_bar, density_gradient_bar
 
 
-def _gather_by_tiles(plan: KernelPlan, saved: SavedPerception, bar: Tensor) -> Tensor:
+def _gather_by_tiles(
+    plan: KernelPlan, saved: SavedPerception, bar: Tensor, bar_row: Tensor | None
+) -> Tensor:
     """Return the gradient with respect to states, [B N, C], with the CUDA kernels in float32."""
     state_gradient = plan.physics.terms.state_gradient
     kernels = listed_adjoint(
@@ -405,6 +485,7 @@ def _gather_by_tiles(plan: KernelPlan, saved: SavedPerception, bar: Tensor) -> T
         saved.starts,
         saved.perception,
         bar,
+        bar_row,
         cotangents,
     )
     states_bar = bar.new_empty(plan.total, plan.state_dim)
@@ -425,6 +506,7 @@ def _gather_by_tiles(plan: KernelPlan, saved: SavedPerception, bar: Tensor) -> T
         *cells,
         *rows,
         bar,
+        bar_row,
         # Twice: in the kernel's vectors of channels, and as its flat array of numbers.
         cotangents,
         cotangents,

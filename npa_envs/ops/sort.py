@@ -223,17 +223,23 @@ def sorts_at_once(world_count: int, particle_count: int) -> bool:
 
 
 def sort_worlds(
-    plan: KernelPlan, x: Tensor, s: Tensor | None, mask: Tensor | None, *, with_rows: bool = True
+    plan: KernelPlan,
+    x: Tensor,
+    s: Tensor | None,
+    mask: Tensor | None,
+    *,
+    with_rows: bool = True,
+    into: dict[str, Tensor] | None = None,
 ) -> SortedWorlds:
     """Return worlds sorted into cells; active particles (`mask`, uint8, [B, N]) get rows.
 
     Arguments are contiguous. `s` None: sorted states are empty. `mask` None: all particles are
-    active. Without `with_rows` tensors of rows are empty.
+    active. Without `with_rows` tensors of rows are empty. `into` has fields to write to.
     """
     # Mask entries that are read if each world counts the rows of earlier worlds.
     earlier = plan.world_count * plan.total if plan.masked else 0
     capacity = 0 if earlier > MAX_MASK else block_capacity(plan.request, x, s, mask)
-    ordered = _empty_worlds(plan, x, s is not None, with_rows)
+    ordered = _empty_worlds(plan, x, s is not None, with_rows)._replace(**into or {})
     if capacity:
         _sort_by_blocks(plan, capacity, x, s, mask, ordered)
     elif plan.runs("sort") == "world" and earlier <= MAX_THREAD_MASK:

@@ -95,6 +95,8 @@ class PerceptionVariant(NamedTuple):
     """Whether each sorted particle has a list; if not, each row has one."""
     tiled: bool = False
     """Whether the lists are stored one after the other, as `tiled_density` writes them."""
+    twice: bool = False
+    """Whether rows are also written in their own order, to an array for the backward pass."""
 
     @property
     def lanes(self) -> int:
@@ -537,6 +539,7 @@ def listed_perception(variant: PerceptionVariant) -> wp.Kernel:
         # outputs
         perception: wp.array2d[scalar],
         row_kernel_sum: wp.array[vector],
+        rows: wp.array2d[scalar],
     ):
         """Write the perception vector of each active particle, as the portable kernel does.
 
@@ -569,7 +572,8 @@ def listed_perception(variant: PerceptionVariant) -> wp.Kernel:
         k = safe_row
         if row_index.shape[0] > 0:
             k = wp.where(present, load_integer(row_index, safe_row), wp.int32(0))
-        destination = wp.where(row < row_capacity, row, wp.int32(-1))
+        own_place = wp.where(row < row_capacity, row, wp.int32(-1))
+        destination = own_place
         if row_destination.shape[0] > 0:
             destination = wp.where(present, load_integer(row_destination, safe_row), destination)
         own_index = k
@@ -620,6 +624,8 @@ def listed_perception(variant: PerceptionVariant) -> wp.Kernel:
             stage(own.scratch, wp.static(2 * width) + channel * wp.static(space_dim), scaled)
         bound = wp.where(limit > scalar(0.0), limit, scalar(wp.static(math.nan)))
         space.write_rows(own.scratch, destination, g, state_dim, bound, perception)
+        if wp.static(variant.twice):
+            space.write_rows(own.scratch, own_place, g, state_dim, bound, rows)
         if wp.static(for_adjoint):
             kernel_sum = add_vector(sums.kernel)
             if destination >= 0 and lane == 0 and g == 0:
@@ -635,6 +641,8 @@ def listed_perception(variant: PerceptionVariant) -> wp.Kernel:
             if destination >= 0 and lane == 0 and g == 0:
                 for d in range(wp.static(space_dim)):
                     perception[destination, column + d] = within(along[d], bound)
+                    if wp.static(variant.twice):
+                        rows[row, column + d] = along[d]
             column += wp.static(space_dim)
         if column < perception.shape[1] and destination >= 0 and g == 0:
             for padding in range(column + lane, perception.shape[1], wp.static(lanes)):

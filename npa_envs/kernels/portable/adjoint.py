@@ -61,14 +61,18 @@ def unscaling_kernel(space: SimpleNamespace, module: wp.Module, state_gradient: 
 
     @wp.func
     def unscaled(
-        perception: wp.array2d[scalar], perception_bar: wp.array2d[scalar], row: int, column: int
+        perception: wp.array2d[scalar],
+        perception_bar: wp.array2d[scalar],
+        row: int,
+        from_row: int,
+        column: int,
     ):
         """Return dL/dv of the vector v whose logarithmic scaling begins at `column`."""
         scaled = vector()
         bar = vector()
         for d in range(wp.static(space_dim)):
             scaled[d] = perception[row, column + d]
-            bar[d] = perception_bar[row, column + d]
+            bar[d] = perception_bar[from_row, column + d]
         return log_scale_adjoint(scaled, bar)
 
     @in_ranges(PAIRS)
@@ -84,23 +88,31 @@ def unscaling_kernel(space: SimpleNamespace, module: wp.Module, state_gradient: 
         starts: wp.array[wp.int32],
         perception: wp.array2d[scalar],
         perception_bar: wp.array2d[scalar],
+        bar_row: wp.array[wp.int32],
         # outputs
         smoothed_bar: wp.array[scalar],
         gradient_bar: wp.array[scalar],
         density_gradient_bar: wp.array[vector],
     ):
-        """Write dL/d(smoothed states), dL/d(state gradients) and dL/d(density gradients)."""
+        """Write dL/d(smoothed states), dL/d(state gradients) and dL/d(density gradients).
+
+        The gradient by row k is in row `bar_row[k]`, if that is empty in row k.
+        """
         row, channel = wp.tid()
         row += range_start
         if row >= starts[starts.shape[0] - 1] - row_base:
             return
+        from_row = row
+        if bar_row.shape[0] > 0:
+            from_row = bar_row[row]
         smoothed = scalar(0.0)
         gradient = vector()
         if channel < state_dim:
-            smoothed = perception_bar[row, state_dim + channel]
+            smoothed = perception_bar[from_row, state_dim + channel]
             if wp.static(state_gradient):
                 column = 2 * state_dim + channel * wp.static(space_dim)
-                gradient = gradient_scale * unscaled(perception, perception_bar, row, column)
+                along = unscaled(perception, perception_bar, row, from_row, column)
+                gradient = gradient_scale * along
         entry = row * group_count + channel / wp.static(width)
         c = channel % wp.static(width)
         smoothed_bar[entry * wp.static(width) + c] = smoothed
@@ -112,7 +124,8 @@ def unscaling_kernel(space: SimpleNamespace, module: wp.Module, state_gradient: 
                 column = 2 * state_dim
                 if wp.static(state_gradient):
                     column += state_dim * wp.static(space_dim)
-                bar = density_scale * unscaled(perception, perception_bar, row, column)
+                along = unscaled(perception, perception_bar, row, from_row, column)
+                bar = density_scale * along
             density_gradient_bar[row] = bar
 
     return unscale_cotangents
@@ -171,6 +184,7 @@ def state_kernel(
         row_positions: wp.array[vector],
         row_kernel_sum: wp.array[vector],
         perception_bar: wp.array2d[scalar],
+        bar_row: wp.array[wp.int32],
         smoothed_bar: wp.array[space.group],
         gradient_bar: wp.array[space.group_gradient],
         flat_gradient_bar: wp.array[scalar],
@@ -212,12 +226,13 @@ def state_kernel(
         total = entry[wp.static(space_dim)] * total
         i = original_index[k]
         row = row_of[i]
+        from_row = wp.where(bar_row.shape[0] > 0, i, row)
         for c in range(wp.static(width)):
             channel = g * wp.static(width) + c
             if channel < state_dim:
                 bar = total[c]
                 if row >= 0:
-                    bar += perception_bar[row, channel]
+                    bar += perception_bar[from_row, channel]
                     if wp.static(state_gradient):
                         place = (row * group_count + g) * wp.static(space_dim)
                         for d in range(wp.static(space_dim)):

@@ -135,11 +135,13 @@ def perception_kernels(
         # outputs
         perception: wp.array2d[scalar],
         row_kernel_sum: wp.array[vector],
+        rows: wp.array2d[scalar],
     ):
         """Write the perception vector of each active particle, then a one, then zeros, as a row.
 
         Rows beyond the last active one are zero. Row k is written to row `row_destination[k]`, or
         to row k if that array is empty. `limit`, unless 0, clips numbers to plus and minus it.
+        What the backward pass reads of it is also written to row k of `rows`, unless that is empty.
         """
         row, g = wp.tid()
         row += range_start
@@ -171,6 +173,8 @@ def perception_kernels(
                     first_column = 2 * state_dim + channel * wp.static(space_dim)
                     for d in range(wp.static(space_dim)):
                         perception[to, first_column + d] = clipped(along[d], limit)
+                        if rows.shape[0] > 0:
+                            rows[row, first_column + d] = along[d]
         if g == 0:
             if row_kernel_sum.shape[0] > 0:
                 row_kernel_sum[row] = kernel_sum
@@ -182,6 +186,8 @@ def perception_kernels(
                 scaled = log_scaled(scaled)
                 for d in range(wp.static(space_dim)):
                     perception[to, column + d] = clipped(scalar(scaled[d]), limit)
+                    if rows.shape[0] > 0:
+                        rows[row, column + d] = scalar(scaled[d])
                 column += wp.static(space_dim)
             for padding in range(column, perception.shape[1]):
                 perception[to, padding] = wp.where(padding == column, scalar(1.0), scalar(0.0))
