@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import collections
+import contextlib
 import copy
 import itertools
 from collections.abc import Hashable, Sequence
@@ -11,9 +12,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import torch
 from torch import Tensor
 
-from npa_envs.checks import FiniteCheck
 from npa_envs.errors import NPAError
 from npa_envs.ops.custom_op import once_differentiable
+from npa_envs.ops.position_check import PositionCheck
 from npa_envs.rule.rule import NPARule
 from npa_envs.world.cuda_graph import GraphSequence, capture, current_stream, prepare_capture
 from npa_envs.world.particles import Particles, combined
@@ -74,6 +75,8 @@ class RolloutCall(NamedTuple):
     """Whether the caller asked for a capture by `cuda_graph=True`."""
     blocks: list[int]
     """Numbers of steps of the graphs to replay, one after the other."""
+    with_paths: bool
+    """Whether path lengths are returned; with gradients they always are."""
 
 
 class _Graphs(NamedTuple):
@@ -100,8 +103,6 @@ class CapturedRollout:
         _, _, self._zero_paths, *_ = worlds
         self.bytes = 0
         """Memory of the graphs [bytes]."""
-        self.ready = torch.cuda.Event()  # type: ignore[no-untyped-call]
-        """Event after which the first worlds are complete."""
         self._spec = call.spec
         self._rules = [_clone(rule, x) for rule in call.rules]
         self._custom_rules = [rule for rule in self._rules if not rule.has_network()]
@@ -139,6 +140,10 @@ class CapturedRollout:
         """Return a call's tensors, in the order of the fixed tensors that they are copied to."""
         return [*call.particles.with_zero_paths(self._zero_paths).tensors(), *call.weights]
 
+    def own_draws(self) -> contextlib.AbstractContextManager[object]:
+        """Return a block after which torch's generator of the CPU is as before, for captures."""
+        return torch.random.fork_rng([]) if self._custom_rules else contextlib.nullcontext()
+
     def capture(self, steps: int, call: RolloutCall) -> None:
         """Capture `steps` steps as CUDA graphs; before the first capture, launch a few of them."""
         if not self.graphs:
@@ -158,7 +163,7 @@ class CapturedRollout:
         def backward() -> None:
             gradients[:] = self._pull_back(results, self._cotangents_of(steps))
 
-        draws = None if self._streams is not None else self._generator
+        draws = self._generator if self._draws_per_step else None
         settings, versions = self._settings(), self._versions()
         forward_graph = capture(forward, self.device, pool=self._pool, generator=draws, alone=True)
         # Not every operator that writes to a buffer changes its version.
@@ -278,7 +283,7 @@ class CapturedRollout:
         """Replay a call's graphs; return copies of the worlds. `use` lives until the last pass."""
         generator = call.generator
         inputs = self._inputs_of(call)
-        self.ready.record(current_stream(self.device))
+        check = PositionCheck(call.particles.x.detach())
         results: list[Particles] = []
         for steps in call.blocks:
             if self.differentiable:
@@ -290,10 +295,10 @@ class CapturedRollout:
                 with hooks:
                     worlds = Particles(*_Replayed.apply(self, steps, generator, *inputs))  # type: ignore[no-untyped-call]
             else:
-                worlds = Particles(*self.forward(steps, inputs, generator))
+                worlds = Particles(*self.forward(steps, inputs, generator, call.with_paths))
             if not results:
-                # Only now, when the device has work: this check takes much CPU time.
-                self._check_positions(call.particles.x, generator, steps)
+                # Only now, when the device has work.
+                self._wait_for(check, generator, steps)
             if self._streams is not None:
                 assert isinstance(generator, WorldRandom)
                 generator.sync_with(self._streams, steps)
@@ -307,15 +312,17 @@ class CapturedRollout:
             results.append(worlds)
             if call.spec.keep_every is not None:
                 worlds = worlds.map(lambda value: value[-1])
+            if worlds.path_length is None:
+                worlds = worlds.with_zero_paths(self._zero_paths)
             inputs = [*worlds.tensors(), *call.weights]
         if call.spec.keep_every is None or len(results) == 1:
             return results[-1]
         return combined(torch.cat, results)
 
-    def _check_positions(self, x: Tensor, generator: Randomness | None, steps: int) -> None:
+    def _wait_for(self, check: PositionCheck, generator: Randomness | None, steps: int) -> None:
         """Raise NPAError, with the generator as before the replay, unless positions are finite."""
         try:
-            FiniteCheck(x, self.ready).wait()
+            check.wait()
         except NPAError:
             if self._streams is None:
                 count = steps * self._draws_per_step
@@ -324,7 +331,11 @@ class CapturedRollout:
             raise
 
     def forward(
-        self, steps: int, tensors: Sequence[Tensor], generator: Randomness | None
+        self,
+        steps: int,
+        tensors: Sequence[Tensor],
+        generator: Randomness | None,
+        with_paths: bool = True,
     ) -> list[Tensor]:
         """Replay a rollout, and return copies of the resulting worlds; not differentiable."""
         with torch.cuda.device(self.device):
@@ -334,7 +345,7 @@ class CapturedRollout:
             graphs = self.graphs[steps]
             self.graphs.move_to_end(steps)
             graphs.forward.replay()
-            return _copies(graphs.worlds)
+            return _copies(graphs.worlds if with_paths else graphs.worlds[:2])
 
     def backward(
         self, steps: int, cotangents: Sequence[Tensor | None], grad_flags: Sequence[bool]
@@ -356,7 +367,7 @@ class CapturedRollout:
         if self._streams is not None:
             assert isinstance(generator, WorldRandom)
             self._streams.put(slice(None), generator)
-        else:
+        elif self._draws_per_step:
             source = torch_generator(generator, self.device)
             self._generator.manual_seed(source.initial_seed())
             self._generator.set_offset(reserve_draws(source, steps * self._draws_per_step))

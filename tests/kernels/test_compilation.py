@@ -32,6 +32,7 @@ from npa_envs.kernels.pictures.pixel_errors import gather_errors
 from npa_envs.kernels.portable.brush_sums import brush_kernel
 from npa_envs.kernels.portable.random_numbers import mix_keys
 from npa_envs.kernels.portable.rewards_and_ends import update_episodes
+from npa_envs.kernels.portable.update import report_finite
 from npa_envs.ops import warmup
 from npa_envs.ops.launch import launch, loaded_modules
 from npa_envs.runtime import start_warp
@@ -50,6 +51,11 @@ VARIANTS = {
     "perceive tiles": lambda: listed_perception(
         PerceptionVariant(2, 16, True, "threshold", True, False, 256, False, 2, True, True)
     ),
+    "perceive twice": lambda: listed_perception(
+        PerceptionVariant(
+            2, 16, True, "threshold", False, False, 128, True, 2, False, True, True
+        )
+    ),
     "adjoint": lambda: listed_adjoint(3, 16, True, True, True).gather_state_cotangents,
     "adjoint 2D": lambda: listed_adjoint(2, 16, True, False, False).unscale_cotangents,
     "network": lambda: two_layer_kernel(4, 2, "relu_store_mask"),
@@ -61,6 +67,7 @@ VARIANTS = {
     "vectors 3D": lambda: row_kernels(3, 32, 17, 8, False).read_rows,
     "sums of vectors": mixing_sum,
     "sums under brushes": lambda: brush_kernel(wp.float32, 3, True),
+    "reports": lambda: report_finite(wp.float32),
     "keys": lambda: mix_keys,
     "steering": lambda: steering_kernels(2, 8, True).steer,
     "steering 3D": lambda: steering_kernels(3, 8, False).steer,
