@@ -117,9 +117,6 @@ def perceive(
     return perception
 
 
-IN_PLACE = True
-
-
 @custom_op("npa::perceive")
 def _perceive(
     x: Tensor, s: Tensor, physics: Physics, for_adjoint: bool, with_positions: bool
@@ -136,16 +133,9 @@ def _perceive(
         block, saved = saved_together(plan, x, with_positions)
         names = SortedWorlds._fields
         into = {k: v for k, v in saved._asdict().items() if k in names and v is not None}
-    # The backward pass reads sorted states.
-    in_place = IN_PLACE and plan.lists_neighbours and not for_adjoint
-    in_place = in_place and plan.state_dim % plan.width == 0 and is_aligned(s)
-    ordered = sort_worlds(plan, x, None if in_place else s, None, into=into)
+    ordered = sort_worlds(plan, x, s, None, into=into)
     densities = compute_densities(
-        plan,
-        ordered,
-        state_index=ordered.original_index if in_place else None,
-        with_particles=for_adjoint,
-        particles=saved and saved.particles,
+        plan, ordered, with_particles=for_adjoint, particles=saved and saved.particles
     )
     launch(
         *perception_launch(
@@ -153,7 +143,6 @@ def _perceive(
             ordered,
             densities,
             out.view(total, -1),
-            states=s if in_place else None,
             destination=ordered.original_index,
             row_kernel_sum=saved and saved.row_kernel_sum,
             rows_out=saved and saved.perception,

@@ -1,4 +1,4 @@
-"""The check that positions are finite, which overlaps with the work that follows it."""
+"""The check that positions are finite, which overlaps with the work that is launched after it."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ PATIENT_READS = 64
 """Number of times that the host reads all reports before it lets other threads run."""
 
 QUERY_INTERVAL = 4096
-"""Number of reads after which the host asks whether the device has failed."""
+"""Number of reads after which the host asks whether the stream's work has ended or failed."""
 
 
 class _Reports(threading.local):
-    """A thread's pinned memory, to which threads of a device report, by device."""
+    """Memory of a thread, by device, to which that device's threads report."""
 
     def __init__(self) -> None:
         self.by_device: dict[torch.device, Tensor] = {}
@@ -42,16 +42,16 @@ _reports = _Reports()
 def checked_positions(x: Tensor) -> Iterator[None]:
     """Check that all positions are finite while the block launches work; raise NPAError after it.
 
-    On a CPU it is checked first. Nothing is checked while torch compiles or captures a CUDA graph.
+    On a CPU they are checked first. Nothing is checked while torch compiles or captures.
     """
     # In this order: torch.compile cannot trace the other calls.
-    if torch.compiler.is_compiling() or (
-        x.is_cuda and torch.cuda.is_current_stream_capturing()
-    ):
+    if torch.compiler.is_compiling() or (x.is_cuda and torch.cuda.is_current_stream_capturing()):
         yield
-    else:
-        check = PositionCheck(x.detach())
+        return
+    check = PositionCheck(x)
+    try:
         yield
+    finally:
         check.wait()
 
 
@@ -59,39 +59,44 @@ class PositionCheck:
     """A check that all positions are finite: it starts when it is made, and `wait` raises.
 
     On CUDA it is on the current stream, so that `wait` waits only for earlier work. x must not
-    change until then.
+    change until then, and a thread waits for one check before it makes another.
     """
 
     def __init__(self, x: Tensor) -> None:
-        self._x, self._slow = x, None
-        if not x.is_cuda:
-            FiniteCheck(x).wait()
-        elif x.numel() > MAX_NUMBERS or not (x.is_contiguous() and is_aligned(x)):
-            self._slow = FiniteCheck(x)
-        else:
-            found = _reports.by_device.get(x.device)
-            if found is None:
-                found = torch.empty(THREADS, dtype=torch.uint8, device="cpu", pin_memory=True)
-                _reports.by_device[x.device] = found
-            self._address = found.data_ptr()
-            # Threads write to the host's memory: a copy and an event would take more CPU time.
-            ctypes.memset(self._address, 0, THREADS)
-            kernel = report_finite(SCALARS[x.dtype])
-            launch(kernel, THREADS, x.device, THREADS, x, found)
+        self._x, self._slow = x.detach(), FiniteCheck(x) if _is_slow(x) else None
+        if self._slow is not None:
+            if not x.is_cuda:
+                self._slow.wait()
+            return
+        reports = _reports.by_device.get(x.device)
+        if reports is None:
+            reports = torch.empty(THREADS, dtype=torch.uint8, device="cpu", pin_memory=x.is_cuda)
+            _reports.by_device[x.device] = reports
+        self._address = reports.data_ptr()
+        ctypes.memset(self._address, 0, THREADS)
+        # It writes to the host's memory: a copy and an event would take more CPU time.
+        launch(report_finite(SCALARS[x.dtype]), THREADS, x.device, THREADS, self._x, reports)
 
     def wait(self) -> None:
         """Wait for the check, not for work after it; raise NPAError if a position is not finite."""
         if self._slow is not None:
             self._slow.wait()
-        if self._slow is not None or not self._x.is_cuda:
             return
         reads = 0
         while 0 in (reports := ctypes.string_at(self._address, THREADS)):
             reads += 1
             if reads > PATIENT_READS:
                 time.sleep(0.0)
-            if reads % QUERY_INTERVAL == 0:
-                # Raises the device's error, if there is one.
-                torch.cuda.current_stream(self._x.device).query()
-        if NOT_FINITE in reports:
+            # The query raises the device's error, if there is one.
+            ended = reads % QUERY_INTERVAL == 0 and torch.cuda.current_stream(self._x.device).query()
+            if ended:
+                break
+        if 0 in reports or NOT_FINITE in reports:
             FiniteCheck(self._x).wait()
+
+
+def _is_slow(x: Tensor) -> bool:
+    """Return whether torch checks positions: on a CPU, or if they are many or in any places."""
+    return (
+        not x.is_cuda or x.numel() > MAX_NUMBERS or not (x.is_contiguous() and is_aligned(x))
+    )

@@ -72,9 +72,9 @@ def run_captured(
     """Run a checked rollout by replaying CUDA graphs; None if it has to be launched."""
     x = particles.x
     # In this order: a compiler cannot trace queries of streams.
-    if cuda_graph is False or not x.is_cuda or torch.compiler.is_compiling() or spec.steps == 0:
+    if cuda_graph is False or torch.compiler.is_compiling() or spec.steps == 0:
         return None
-    if not can_capture() or torch.cuda.is_current_stream_capturing():
+    if not _may_capture(x):
         return None
     explicit = cuda_graph is True
     plain = [rule.has_network() for rule in rules]
@@ -106,6 +106,11 @@ def run_captured(
     if not all(plain) and not use.rollout.compared.issuperset(call.blocks):
         return _run_and_compare(call, group, use)
     return use.rollout.replay(call, use)
+
+
+def _may_capture(x: Tensor) -> bool:
+    """Return whether rollouts of these positions can be captured now."""
+    return x.is_cuda and can_capture() and not torch.cuda.is_current_stream_capturing()
 
 
 def _grad_flags(particles: Particles, weights: list[Tensor]) -> tuple[bool, ...]:

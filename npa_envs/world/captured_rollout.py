@@ -312,7 +312,7 @@ class CapturedRollout:
             results.append(worlds)
             if call.spec.keep_every is not None:
                 worlds = worlds.map(lambda value: value[-1])
-            if worlds.path_length is None:
+            if len(worlds.tensors()) < len(self._worlds.tensors()):
                 worlds = worlds.with_zero_paths(self._zero_paths)
             inputs = [*worlds.tensors(), *call.weights]
         if call.spec.keep_every is None or len(results) == 1:

@@ -9,7 +9,7 @@ from support.refusals import refused
 from support.worlds import assert_same, random_world
 
 import npa_envs
-from npa_envs.ops import launch
+from npa_envs.ops import launch, position_check
 from npa_envs.ops.perceive import _gather_fields, _perceive
 from npa_envs.ops.perception_passes import perceive_backward
 from npa_envs.ops.random_numbers import draw
@@ -130,8 +130,12 @@ def test_threads_and_modes_repeat_on_their_own(device):
             done.result()
 
 
+@pytest.mark.parametrize("fast", [False, True])
 @pytest.mark.parametrize("size", [7, 60, 4000, 140_000])
-def test_positions_that_are_not_finite_are_refused_by_all_checks(size, device):
+def test_positions_that_are_not_finite_are_refused_by_all_checks(size, fast, device, monkeypatch):
+    if fast:
+        # On a CPU as well, threads report.
+        monkeypatch.setattr(position_check, "_is_slow", lambda x: False)
     x, s = random_world(1, size, 2, 1, dtype=torch.float32, device=device)
     # Beside a multiple of what a thread reads at once.
     for k in {0, size // 3, size - 1}:
