@@ -88,13 +88,16 @@ class CustomOp(Generic[Arguments, Result]):
 
     It needs one under torch.compile, in dispatch modes and for tensor subclasses. Elsewhere an
     operator's call would cost as much CPU time as several launches, and later calls repeat the
-    launches of earlier ones (`npa_envs.ops.launch.repeated`). Arguments are positional.
+    launches of earlier ones (`npa_envs.ops.launch.repeated`): on CUDA, and with `of_all` on a CPU,
+    where numbers of active particles change sizes in each step. Arguments are positional.
     Results share no memory with each other or with arguments. The operator takes a `Physics` as the
     list `Physics.numbers`. With torch's fake tensors, which have no memory, nothing is launched.
     """
 
-    def __init__(self, name: str, function: Callable[Arguments, Result]) -> None:
-        self._function = function
+    def __init__(
+        self, name: str, function: Callable[Arguments, Result], *, of_all: bool = False
+    ) -> None:
+        self._function, self._of_all = function, of_all
         self._signature = inspect.signature(function, eval_str=True)
         self._operator = torch.library.custom_op(
             name, self._taking_lists(function), mutates_args=()
@@ -131,13 +134,20 @@ class CustomOp(Generic[Arguments, Result]):
             flat = [value.numbers() if isinstance(value, Physics) else value for value in args]
             result: Result = self._operator(*flat)
             return result
+        if not (self._of_all or getattr(args[0], "is_cuda", False)):
+            return self._function(*args, **kwargs)
         made: Result = repeated(self._function, args)
         return made
 
 
-def custom_op(name: str) -> Callable[[Callable[Arguments, Result]], CustomOp[Arguments, Result]]:
-    """Return a decorator that makes a function of tensors the operator `name`, "npa::..."."""
-    return lambda function: CustomOp(name, function)
+def custom_op(
+    name: str, *, of_all: bool = False
+) -> Callable[[Callable[Arguments, Result]], CustomOp[Arguments, Result]]:
+    """Return a decorator that makes a function of tensors the operator `name`, "npa::...".
+
+    `of_all`: it is of all particles of worlds, so that its calls have few forms.
+    """
+    return lambda function: CustomOp(name, function, of_all=of_all)
 
 
 def without_autocast(backward: Callable[Arguments, Result]) -> Callable[Arguments, Result]:

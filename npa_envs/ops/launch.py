@@ -70,8 +70,8 @@ class _ThreadState(threading.local):
         """Sequence to which this thread's launches are appended; None: they are not recorded."""
         self.traced = False
         """Whether tensors have no memory, so that nothing is launched."""
-        self.calls: collections.OrderedDict[Hashable, _Calls] = collections.OrderedDict()
-        """Operators' calls by function and forms of arguments, the least recently used first."""
+        self.calls: collections.OrderedDict[Hashable, int | _Repeat] = collections.OrderedDict()
+        """Number of an operator's calls, or their launches, by function and forms of arguments."""
 
 
 _thread = _ThreadState()
@@ -385,7 +385,8 @@ class RecordedLaunches:
     """A sequence of launches to replay with the same arguments, but for tensors that are moved."""
 
     def __init__(self) -> None:
-        self._launches: list[tuple[_PreparedLaunch, tuple[int, ...]]] = []
+        self.launches: list[tuple[_PreparedLaunch, tuple[int, ...]]] = []
+        """All launches and their sizes."""
         self._tensors: list[list[Any]] = []
         """Tensors in the arguments, kept alive: the arguments contain only their addresses."""
 
@@ -402,7 +403,7 @@ class RecordedLaunches:
         arguments = (0, *arguments) if kernel in MIN_RANGES else arguments
         prepared = _prepare(kernel, size, device, block_dim, *arguments)
         prepared.set(arguments)
-        self._launches.append((prepared, size))
+        self.launches.append((prepared, size))
         self._tensors.append(list(arguments))
         return prepared
 
@@ -417,15 +418,11 @@ class RecordedLaunches:
 
     def __len__(self) -> int:
         """Return the number of launches."""
-        return len(self._launches)
+        return len(self.launches)
 
-    def steps(self) -> list[tuple[_PreparedLaunch, tuple[int, ...]]]:
-        """Return all launches and their sizes."""
-        return self._launches
-
-    def tensors(self) -> Iterator[tuple[Any, Tensor]]:
+    def addresses(self) -> Iterator[tuple[Any, Tensor]]:
         """Yield each tensor that is not empty, with the number that is its address in arguments."""
-        for (prepared, _), arguments in zip(self._launches, self._tensors, strict=True):
+        for (prepared, _), arguments in zip(self.launches, self._tensors, strict=True):
             for k, value in enumerate(arguments):
                 if isinstance(value, Tensor) and value.numel():
                     yield prepared.address_of(k), value
@@ -433,7 +430,7 @@ class RecordedLaunches:
     def argument_slots(self, tensor: Tensor) -> list[tuple[_PreparedLaunch, int]]:
         """Return launches and indices whose argument is `tensor`, which the caller keeps alive."""
         slots, address = [], tensor.data_ptr()
-        for (prepared, _), arguments in zip(self._launches, self._tensors, strict=True):
+        for (prepared, _), arguments in zip(self.launches, self._tensors, strict=True):
             for k, value in enumerate(arguments):
                 if isinstance(value, Tensor) and value.data_ptr() == address:
                     arguments[k] = None
@@ -449,20 +446,11 @@ class RecordedLaunches:
         self, begin: int = 0, end: int | None = None, *, last_count: int | None = None
     ) -> None:
         """Repeat launches [begin, end); `last_count` replaces the first size of the last one."""
-        launches = self._launches[begin:end]
+        launches = self.launches[begin:end]
         for prepared, size in launches[:-1]:
             prepared.run(size)
         prepared, size = launches[-1]
         prepared.run(size if last_count is None else (last_count, *size[1:]))
-
-
-class _Calls:
-    """The calls of an operator with arguments of the same forms, in one thread."""
-
-    def __init__(self) -> None:
-        self.count = 0
-        self.repeat: _Repeat | None = None
-        """Its launches; None: they are not recorded yet, or cannot be repeated."""
 
 
 MAX_REPEATED = 128
@@ -499,95 +487,98 @@ def repeated(function: Callable[..., Any], arguments: Sequence[Any]) -> Any:
                 key.append(value)
         key.append(several)
     of_thread, kind = _thread.calls, tuple(key)
-    calls = of_thread.get(kind)
-    if calls is None:
-        calls = of_thread[kind] = _Calls()
-        if len(of_thread) > MAX_REPEATED:
-            of_thread.popitem(last=False)
-    else:
-        of_thread.move_to_end(kind)
-    if calls.repeat is not None:
-        return calls.repeat.run(tensors)
-    calls.count += 1
-    if calls.count != 1 + CALLED_FIRST:
+    calls = of_thread.pop(kind, 0)
+    of_thread[kind] = calls if isinstance(calls, _Repeat) else calls + 1
+    if len(of_thread) > MAX_REPEATED:
+        of_thread.popitem(last=False)
+    if isinstance(calls, _Repeat):
+        return calls.run(tensors)
+    if calls != CALLED_FIRST:
         return function(*arguments)
     recorded, watch = RecordedLaunches(), _WatchedOperators()
     with recorded.recording(), watch:
         results = function(*arguments)
     if watch.only_allocates:
         with contextlib.suppress(LookupError):
-            calls.repeat = _Repeat(recorded, tensors, results)
+            of_thread[kind] = _Repeat(recorded, tensors, results, watch.allocated)
     return results
 
 
 class _WatchedOperators(TorchDispatchMode):
-    """Notes whether torch's operators in the block only allocate memory and make views."""
+    """Notes whether torch's operators in the block only allocate memory, and make views of it."""
 
-    only_allocates = True
+    def __init__(self) -> None:
+        super().__init__()  # type: ignore[no-untyped-call]
+        self.only_allocates = True
+        self.allocated: set[int] = set()
+        """Addresses of the memory."""
 
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         """Run an operator of torch."""
-        allocates = func.name().startswith(("aten::empty", "aten::new_empty"))
-        self.only_allocates &= allocates or func.is_view
-        return func(*args, **(kwargs or {}))
+        result = func(*args, **(kwargs or {}))
+        if func.name().startswith(("aten::empty", "aten::new_empty")):
+            self.allocated.add(result.untyped_storage().data_ptr())
+        else:
+            self.only_allocates &= func.is_view
+        return result
 
 
 class _Repeat:
     """The launches of an operator's call, to repeat with other tensors of the same forms.
 
-    Raises LookupError if the memory of two of the call's tensors overlaps.
+    Raises LookupError if tensors share memory, or are neither arguments nor `allocated`.
     """
 
     def __init__(
-        self, recorded: RecordedLaunches, inputs: Sequence[Tensor], results: Any
+        self,
+        recorded: RecordedLaunches,
+        inputs: Sequence[Tensor],
+        results: Any,
+        allocated: set[int],
     ) -> None:
         self._several = None if isinstance(results, Tensor) else type(results)
         made: list[Tensor] = [results] if self._several is None else [*results]
         self._forms = [(each.shape, each.dtype, each.device) for each in made]
-        self._launches = [(prepared.run, size) for prepared, size in recorded.steps()]
+        self._launches, self._block_bytes = recorded.launches, 0
         self._addresses: list[tuple[Any, int, int]] = []
         """Addresses in arguments, each with the index of a result or input, and a distance [bytes]
         from its begin; the index after the last is that of the block for all other tensors."""
-        owners = [*made, *inputs]
-        regions = [(owner.data_ptr(), owner.nbytes) for owner in owners if owner.nbytes]
-        ordered = sorted(regions)
-        if any(a + size > b for (a, size), (b, _) in itertools.pairwise(ordered)):
-            raise LookupError("arguments share memory")
+        regions = [(each.data_ptr(), each.data_ptr() + each.nbytes) for each in (*made, *inputs)]
+        filled = sorted(region for region in regions if region[0] < region[1])
+        if any(end > begin for (_, end), (begin, _) in itertools.pairwise(filled)):
+            raise LookupError("tensors share memory")
         places: dict[int, int] = {}
-        self._block_bytes = 0
-        for address_of, tensor in recorded.tensors():
-            begin = tensor.data_ptr()
+        for address, tensor in recorded.addresses():
+            storage, begin = tensor.untyped_storage(), tensor.data_ptr()
             extents = zip(tensor.shape, tensor.stride(), strict=True)
-            last = sum((size - 1) * stride for size, stride in extents)
-            end = begin + (last + 1) * tensor.itemsize
-            for index, owner in enumerate(owners):
-                distance = begin - owner.data_ptr()
-                if 0 <= distance < owner.nbytes:
-                    if end > begin - distance + owner.nbytes:
-                        raise LookupError("an argument is larger than the tensor that it is of")
-                    break
-            else:
-                storage = tensor.untyped_storage()
-                index, whole = len(owners), storage.data_ptr()
+            end = begin + (1 + sum((n - 1) * stride for n, stride in extents)) * tensor.itemsize
+            owners = [k for k, (first, last) in enumerate(regions) if first <= begin < last]
+            whole = storage.data_ptr()
+            if owners:
+                index, distance = owners[0], begin - regions[owners[0]][0]
+                if end > regions[index][1]:
+                    raise LookupError("an array is larger than the tensor that it begins in")
+            elif whole in allocated:
                 if whole not in places:
                     places[whole] = self._block_bytes
                     self._block_bytes += -(-storage.nbytes() // ALIGNMENT) * ALIGNMENT
-                distance = places[whole] + begin - whole
-            self._addresses.append((address_of, index, distance))
+                index, distance = len(regions), places[whole] + begin - whole
+            else:
+                raise LookupError("a tensor is not one of the call's")
+            self._addresses.append((address, index, distance))
 
     def run(self, inputs: Sequence[Tensor]) -> Any:
         """Return the operator's results for other tensors."""
         made = [torch.empty(shape, dtype=dtype, device=on) for shape, dtype, on in self._forms]
-        begins = [tensor.data_ptr() for tensor in made]
-        begins += [tensor.data_ptr() for tensor in inputs]
+        begins = [tensor.data_ptr() for tensor in (*made, *inputs)]
         if self._block_bytes:
             device = inputs[0].device
             block = torch.empty(self._block_bytes, dtype=torch.uint8, device=device)
             begins.append(block.data_ptr())
         for address, index, distance in self._addresses:
             address.value = begins[index] + distance
-        for run, size in self._launches:
-            run(size)
+        for prepared, size in self._launches:
+            prepared.run(size)
         return made[0] if self._several is None else self._several(made)
 
 

@@ -117,7 +117,7 @@ def perceive(
     return perception
 
 
-@custom_op("npa::perceive")
+@custom_op("npa::perceive", of_all=True)
 def _perceive(
     x: Tensor, s: Tensor, physics: Physics, for_adjoint: bool, with_positions: bool
 ) -> tuple[Tensor, Tensor]:
@@ -203,11 +203,11 @@ def perception_fields(
     physics = checked_physics(x, s, eps, None, box, Terms(moment_inverse=inverse))
     with checked_positions(x):
         *fields, gradients, row_of = _gather_fields(x.contiguous(), s.contiguous(), physics)
-        drho = gradients[row_of].to(x.dtype).view(x.shape)
-    return PerceptionFields(*fields, drho)
+        fields.append(gradients[row_of].to(x.dtype).view(x.shape))
+    return PerceptionFields._make(fields)
 
 
-@custom_op("npa::perception_fields")
+@custom_op("npa::perception_fields", of_all=True)
 def _gather_fields(x: Tensor, s: Tensor, physics: Physics) -> list[Tensor]:
     """Return all fields but density gradients; then these of rows, [B N, D], and each one's row."""
     world_count, particle_count, space_dim = worlds = tuple(map(int, x.shape))

@@ -284,6 +284,7 @@ def saved_together(
     shapes |= {"row_positions": (total, dims), "particles": (total, dims + 1)}
     shapes |= {"states": (total * plan.group_count, plan.width)} if with_states else {}
     indices = {"row_of": (total,), "starts": (plan.start_count,), "original_index": (total,)}
+    forms: list[tuple[str, tuple[int, ...], torch.dtype]]
     forms = [(name, shape, like.dtype) for name, shape in shapes.items()]
     forms += [(name, shape, torch.int32) for name, shape in indices.items()]
     sizes = [math.prod(shape) * dtype.itemsize for _, shape, dtype in forms]
@@ -297,7 +298,7 @@ def saved_together(
     return block, SavedPerception(**parts)
 
 
-@custom_op("npa::perceive_backward")
+@custom_op("npa::perceive_backward", of_all=True)
 def perceive_backward(
     perception_bar: Tensor,
     block: Tensor,

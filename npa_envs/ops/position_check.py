@@ -21,21 +21,13 @@ THREADS = 2048
 MAX_NUMBERS = 2**18
 """Maximum number of coordinates that they check; work on more hides torch's slower check."""
 
-PATIENT_READS = 64
-"""Number of times that the host reads all reports before it lets other threads run."""
-
-QUERY_INTERVAL = 4096
-"""Number of reads after which the host asks whether the stream's work has ended or failed."""
+PATIENT_READS, QUERY_INTERVAL = 64, 4096
+"""Numbers of the host's reads of all reports: after the first it lets other threads run, and at
+multiples of the second it asks whether the stream's work has ended or failed."""
 
 
-class _Reports(threading.local):
-    """Memory of a thread, by device, to which that device's threads report."""
-
-    def __init__(self) -> None:
-        self.by_device: dict[torch.device, Tensor] = {}
-
-
-_reports = _Reports()
+_reports = threading.local()
+"""Attributes of a host's thread: for each device the memory to which its threads report."""
 
 
 @contextlib.contextmanager
@@ -68,10 +60,10 @@ class PositionCheck:
             if not x.is_cuda:
                 self._slow.wait()
             return
-        reports = _reports.by_device.get(x.device)
+        reports = vars(_reports).get(str(x.device))
         if reports is None:
             reports = torch.empty(THREADS, dtype=torch.uint8, device="cpu", pin_memory=x.is_cuda)
-            _reports.by_device[x.device] = reports
+            setattr(_reports, str(x.device), reports)
         self._address = reports.data_ptr()
         ctypes.memset(self._address, 0, THREADS)
         # It writes to the host's memory: a copy and an event would take more CPU time.
@@ -88,8 +80,8 @@ class PositionCheck:
             if reads > PATIENT_READS:
                 time.sleep(0.0)
             # The query raises the device's error, if there is one.
-            ended = reads % QUERY_INTERVAL == 0 and torch.cuda.current_stream(self._x.device).query()
-            if ended:
+            stream = None if reads % QUERY_INTERVAL else torch.cuda.current_stream(self._x.device)
+            if stream is not None and stream.query():
                 break
         if 0 in reports or NOT_FINITE in reports:
             FiniteCheck(self._x).wait()
@@ -97,6 +89,4 @@ class PositionCheck:
 
 def _is_slow(x: Tensor) -> bool:
     """Return whether torch checks positions: on a CPU, or if they are many or in any places."""
-    return (
-        not x.is_cuda or x.numel() > MAX_NUMBERS or not (x.is_contiguous() and is_aligned(x))
-    )
+    return not (x.is_cuda and x.numel() <= MAX_NUMBERS and x.is_contiguous() and is_aligned(x))

@@ -79,7 +79,8 @@ def run_captured(
     explicit = cuda_graph is True
     plain = [rule.has_network() for rule in rules]
     if not all(plain):
-        observed = not explicit and any(map(is_observed, itertools.compress(rules, map(not_, plain))))
+        own = itertools.compress(rules, map(not_, plain))
+        observed = not explicit and any(map(is_observed, own))
         if observed or torch.is_autocast_enabled(x.device.type):
             return None
     forms, rule_weights = zip(*map(settings_and_weights, rules, plain), strict=True)

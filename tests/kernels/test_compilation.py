@@ -52,9 +52,7 @@ VARIANTS = {
         PerceptionVariant(2, 16, True, "threshold", True, False, 256, False, 2, True, True)
     ),
     "perceive twice": lambda: listed_perception(
-        PerceptionVariant(
-            2, 16, True, "threshold", False, False, 128, True, 2, False, True, True
-        )
+        PerceptionVariant(2, 16, True, "threshold", False, False, 128, True, 2, False, True, True)
     ),
     "adjoint": lambda: listed_adjoint(3, 16, True, True, True).gather_state_cotangents,
     "adjoint 2D": lambda: listed_adjoint(2, 16, True, False, False).unscale_cotangents,

@@ -1,4 +1,4 @@
-"""The cache of captures, with graphs that a CPU emulates: a replay runs the captured function again.
+"""The cache of captures, with graphs that a CPU emulates: a replay runs the function again.
 
 Its numbers are those of launches; a network's Python code runs in each replay, unlike on CUDA.
 """
@@ -105,7 +105,9 @@ def follows(rules, calls, **options):
     return seen
 
 
-@pytest.mark.parametrize("options", [{}, {"gradients": False, "steps": 70, "keep_every": 5}], ids=str)
+@pytest.mark.parametrize(
+    "options", [{}, {"gradients": False, "steps": 70, "keep_every": 5}], ids=str
+)
 @pytest.mark.parametrize("kind", [Own, npa_envs.NPARule])
 def test_replays_have_the_results_of_launches(kind, options, replays):
     rules = make_rule(kind), make_rule(kind)
