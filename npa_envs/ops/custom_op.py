@@ -88,15 +88,13 @@ class CustomOp(Generic[Arguments, Result]):
 
     It needs one under torch.compile, in dispatch modes and for tensor subclasses. Elsewhere an
     operator's call would cost as much CPU time as several launches, and later calls repeat the
-    launches of earlier ones (`npa_envs.ops.launch.repeated`): on CUDA, and with `of_all` on a CPU,
-    where numbers of active particles change sizes in each step. Arguments are positional.
+    launches of earlier ones (`npa_envs.ops.launch.repeated`). On a CPU only operators `of_all`
+    particles do so: numbers of active ones change in each step. Arguments are positional.
     Results share no memory with each other or with arguments. The operator takes a `Physics` as the
     list `Physics.numbers`. With torch's fake tensors, which have no memory, nothing is launched.
     """
 
-    def __init__(
-        self, name: str, function: Callable[Arguments, Result], *, of_all: bool = False
-    ) -> None:
+    def __init__(self, name: str, function: Callable[Arguments, Result], of_all: bool) -> None:
         self._function, self._of_all = function, of_all
         self._signature = inspect.signature(function, eval_str=True)
         self._operator = torch.library.custom_op(
@@ -143,11 +141,8 @@ class CustomOp(Generic[Arguments, Result]):
 def custom_op(
     name: str, *, of_all: bool = False
 ) -> Callable[[Callable[Arguments, Result]], CustomOp[Arguments, Result]]:
-    """Return a decorator that makes a function of tensors the operator `name`, "npa::...".
-
-    `of_all`: it is of all particles of worlds, so that its calls have few forms.
-    """
-    return lambda function: CustomOp(name, function, of_all=of_all)
+    """Return a decorator that makes a function of tensors the operator `name`, "npa::..."."""
+    return lambda function: CustomOp(name, function, of_all)
 
 
 def without_autocast(backward: Callable[Arguments, Result]) -> Callable[Arguments, Result]:

@@ -190,14 +190,14 @@ class _PreparedLaunch:
         self._bounds: dict[tuple[int, ...], Any] = {}
         parameters = packed.params[1:]
         fields = [(f"a{k}", type(value)) for k, value in enumerate(parameters)]
-        self._memory: Any = _argument_struct(tuple(fields))(*parameters)
+        self.memory: Any = _argument_struct(tuple(fields))(*parameters)
         """Struct of all arguments, which the kernel reads."""
-        self._names = [name for name, _ in fields]
+        self.names = [name for name, _ in fields]
         self._writers: list[tuple[int, Callable[[Any], None]]] = []
         """Index of each argument that is an array or a struct, and the function that writes it."""
         self._number_indices: list[int] = []
-        for k, (name, argument) in enumerate(zip(self._names, packed.kernel.adj.args, strict=True)):
-            memory, declared = getattr(self._memory, name), _type_of(argument)
+        for k, (name, argument) in enumerate(zip(self.names, packed.kernel.adj.args, strict=True)):
+            memory, declared = getattr(self.memory, name), _type_of(argument)
             if isinstance(declared, wp.array):
                 self._writers.append((k, _ArrayArgument(memory, declared).set))
             elif hasattr(arguments[k], "__ctype__"):
@@ -217,16 +217,11 @@ class _PreparedLaunch:
                 last[k] = value
                 declared = self._warp_launch.kernel.adj.args[k].type
                 number = declared(*value) if isinstance(value, tuple) else value
-                setattr(self._memory, self._names[k], number)
-
-    def address_of(self, index: int) -> Any:
-        """Return the C number that is the address of an array argument's tensor, to overwrite."""
-        descriptor = getattr(self._memory, self._names[index])
-        return ctypes.c_uint64.from_buffer(descriptor, type(descriptor).data.offset)
+                setattr(self.memory, self.names[k], number)
 
     def set_address(self, index: int, tensor: Tensor) -> None:
         """Point an array argument at another tensor of the same shape and dtype."""
-        getattr(self._memory, self._names[index]).data = tensor.data_ptr() or _empty_address(tensor)
+        getattr(self.memory, self.names[index]).data = tensor.data_ptr() or _empty_address(tensor)
 
     def run(self, size: tuple[int, ...]) -> None:
         """Launch the kernel with `size` threads along each dimension."""
@@ -259,12 +254,12 @@ class _CpuLaunch(_PreparedLaunch):
         if len(ranges) > 1:
             run_together([functools.partial(self._run_range, size, part) for part in ranges])
         else:
-            self._run_in_this_thread(self._memory, size)
+            self._run_in_this_thread(self.memory, size)
 
     def _run_range(self, size: tuple[int, ...], indices: range) -> None:
         """Run the threads whose first index is in `indices`, on a copy of the arguments."""
-        memory = type(self._memory).from_buffer_copy(self._memory)
-        setattr(memory, self._names[0], indices.start)
+        memory = type(self.memory).from_buffer_copy(self.memory)
+        setattr(memory, self.names[0], indices.start)
         self._run_in_this_thread(memory, (len(indices), *size[1:]))
 
     def _run_in_this_thread(self, memory: Any, size: tuple[int, ...]) -> None:
@@ -276,8 +271,8 @@ class _CudaLaunch(_PreparedLaunch):
 
     def __init__(self, packed: Any, device: torch.device, *arguments: Any) -> None:
         super().__init__(packed, device, *arguments)
-        begin, layout = ctypes.addressof(self._memory), type(self._memory)
-        addresses = [begin + getattr(layout, name).offset for name in self._names]
+        begin, layout = ctypes.addressof(self.memory), type(self.memory)
+        addresses = [begin + getattr(layout, name).offset for name in self.names]
         self._addresses = (ctypes.c_void_p * (1 + len(addresses)))(0, *addresses)
         """Addresses of the launch's size, which `run` writes, and of each argument."""
         packed.params_addr = self._addresses
@@ -425,7 +420,9 @@ class RecordedLaunches:
         for (prepared, _), arguments in zip(self.launches, self._tensors, strict=True):
             for k, value in enumerate(arguments):
                 if isinstance(value, Tensor) and value.numel():
-                    yield prepared.address_of(k), value
+                    descriptor = getattr(prepared.memory, prepared.names[k])
+                    offset = type(descriptor).data.offset
+                    yield ctypes.c_uint64.from_buffer(descriptor, offset), value
 
     def argument_slots(self, tensor: Tensor) -> list[tuple[_PreparedLaunch, int]]:
         """Return launches and indices whose argument is `tensor`, which the caller keeps alive."""

@@ -131,8 +131,8 @@ def _perceive(
     block, saved, into = x.new_empty(0, dtype=torch.uint8), None, {}
     if for_adjoint:
         block, saved = saved_together(plan, x, with_positions)
-        names = SortedWorlds._fields
-        into = {k: v for k, v in saved._asdict().items() if k in names and v is not None}
+        parts = saved._asdict().items()
+        into = {k: v for k, v in parts if k in SortedWorlds._fields and v is not None}
     ordered = sort_worlds(plan, x, s, None, into=into)
     densities = compute_densities(
         plan, ordered, with_particles=for_adjoint, particles=saved and saved.particles

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 from typing import Any, NamedTuple
 
@@ -279,22 +278,20 @@ def saved_together(
     `block` None: a new one. `like` is a tensor of the worlds' dtype and device.
     """
     total, dims = plan.total, plan.space_dim
-    width = plan.physics.terms.perception_dim(dims, plan.state_dim)
-    shapes = {"perception": (total, width), "row_kernel_sum": (total, dims)}
-    shapes |= {"row_positions": (total, dims), "particles": (total, dims + 1)}
-    shapes |= {"states": (total * plan.group_count, plan.width)} if with_states else {}
     indices = {"row_of": (total,), "starts": (plan.start_count,), "original_index": (total,)}
-    forms: list[tuple[str, tuple[int, ...], torch.dtype]]
-    forms = [(name, shape, like.dtype) for name, shape in shapes.items()]
-    forms += [(name, shape, torch.int32) for name, shape in indices.items()]
-    sizes = [math.prod(shape) * dtype.itemsize for _, shape, dtype in forms]
-    ends = [*itertools.accumulate(-(-size // ALIGNMENT) * ALIGNMENT for size in sizes)]
+    width = plan.physics.terms.perception_dim(dims, plan.state_dim)
+    shapes: dict[str, tuple[int, ...]] = indices | {"perception": (total, width)}
+    shapes |= {"row_kernel_sum": (total, dims), "row_positions": (total, dims)}
+    shapes |= {"states": (total * plan.group_count, plan.width)} if with_states else {}
+    shapes |= {"particles": (total, dims + 1)}
+    counts = [math.prod(shape) for shape in shapes.values()]
+    sizes = [-(-count * like.itemsize // ALIGNMENT) * ALIGNMENT for count in counts]
     if block is None:
-        block = torch.empty(ends[-1], dtype=torch.uint8, device=like.device)
-    parts = {
-        name: block[begin : begin + size].view(dtype).view(shape)
-        for (name, shape, dtype), begin, size in zip(forms, (0, *ends), sizes, strict=False)
-    }
+        block = torch.empty(sum(sizes), dtype=torch.uint8, device=like.device)
+    parts = {}
+    for name, count, part in zip(shapes, counts, block.split(sizes), strict=True):
+        numbers = part.view(torch.int32 if name in indices else like.dtype)
+        parts[name] = numbers[:count].view(shapes[name])
     return block, SavedPerception(**parts)
 
 
@@ -361,17 +358,6 @@ def _pull_back(
     if plan.runs("adjoint", position_gradient=saved.states is not None) == "cuda":
         states_bar = _gather_by_tiles(plan, saved, bar, bar_row)
         return states_bar, states_bar.new_empty(0)
-    return _gather_by_cells(plan, saved, static_neighbours, bar, bar_row)
-
-
-def _gather_by_cells(
-    plan: KernelPlan,
-    saved: SavedPerception,
-    static_neighbours: list[Tensor],
-    bar: Tensor,
-    bar_row: Tensor | None,
-) -> tuple[Tensor, Tensor]:
-    """Return both gradients of `perceive_rows_backward`, with the portable kernels."""
     neighbours, ends = static_neighbours or (None, None)
     space_dim, group_count = plan.space_dim, plan.group_count
     terms, with_positions = plan.physics.terms, saved.states is not None

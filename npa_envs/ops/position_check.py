@@ -1,9 +1,10 @@
-"""The check that positions are finite, which overlaps with the work that is launched after it."""
+"""The check that positions are finite, which overlaps with the work launched after it."""
 
 from __future__ import annotations
 
 import contextlib
 import ctypes
+import itertools
 import threading
 import time
 from collections.abc import Iterator
@@ -22,8 +23,7 @@ MAX_NUMBERS = 2**18
 """Maximum number of coordinates that they check; work on more hides torch's slower check."""
 
 PATIENT_READS, QUERY_INTERVAL = 64, 4096
-"""Numbers of the host's reads of all reports: after the first it lets other threads run, and at
-multiples of the second it asks whether the stream's work has ended or failed."""
+"""Reads of all reports after which the host lets others run, and asks if the stream has failed."""
 
 
 _reports = threading.local()
@@ -74,14 +74,14 @@ class PositionCheck:
         if self._slow is not None:
             self._slow.wait()
             return
-        reads = 0
-        while 0 in (reports := ctypes.string_at(self._address, THREADS)):
-            reads += 1
+        for reads in itertools.count(1):
+            reports = ctypes.string_at(self._address, THREADS)
+            if 0 not in reports:
+                break
             if reads > PATIENT_READS:
                 time.sleep(0.0)
-            # The query raises the device's error, if there is one.
-            stream = None if reads % QUERY_INTERVAL else torch.cuda.current_stream(self._x.device)
-            if stream is not None and stream.query():
+            # It raises the device's error, if there is one.
+            if reads % QUERY_INTERVAL == 0 and torch.cuda.current_stream(self._x.device).query():
                 break
         if 0 in reports or NOT_FINITE in reports:
             FiniteCheck(self._x).wait()

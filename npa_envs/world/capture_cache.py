@@ -67,7 +67,6 @@ def run_captured(
     generator: Randomness | None,
     *,
     cuda_graph: CudaGraph,
-    with_paths: bool,
 ) -> Particles | None:
     """Run a checked rollout by replaying CUDA graphs; None if it has to be launched."""
     x = particles.x
@@ -98,9 +97,7 @@ def run_captured(
     if grad_flags and (spec.steps > MAX_STEPS or _saves_tensors_elsewhere()):
         return None
     blocks = _blocks(spec, with_gradients=bool(grad_flags))
-    call = RolloutCall(
-        spec, rules, particles, weights, grad_flags, generator, explicit, blocks, with_paths
-    )
+    call = RolloutCall(spec, rules, particles, weights, grad_flags, generator, explicit, blocks)
     use = _reserve_capture(group, call)
     if use is None:
         return None
@@ -163,8 +160,7 @@ def _run_and_compare(call: RolloutCall, group: CallGroup, use: CaptureUse) -> Pa
     step = call.spec.make_step(call.rules, worlds)
     launched = call.spec.launch(step, call.rules, worlds, generator)
     with torch.no_grad():
-        repeat = call._replace(weights=copies, generator=source, with_paths=True)
-        replayed = use.rollout.replay(repeat, use)
+        replayed = use.rollout.replay(call._replace(weights=copies, generator=source), use)
     expected, found = [*launched.tensors(), *weights], [*replayed.tensors(), *copies]
     ends = [value for value in launched.tensors() if value.requires_grad]
     # Recomputed once more, a module might change its buffers again.

@@ -75,8 +75,6 @@ class RolloutCall(NamedTuple):
     """Whether the caller asked for a capture by `cuda_graph=True`."""
     blocks: list[int]
     """Numbers of steps of the graphs to replay, one after the other."""
-    with_paths: bool
-    """Whether path lengths are returned; with gradients they always are."""
 
 
 class _Graphs(NamedTuple):
@@ -295,7 +293,7 @@ class CapturedRollout:
                 with hooks:
                     worlds = Particles(*_Replayed.apply(self, steps, generator, *inputs))  # type: ignore[no-untyped-call]
             else:
-                worlds = Particles(*self.forward(steps, inputs, generator, call.with_paths))
+                worlds = Particles(*self.forward(steps, inputs, generator))
             if not results:
                 # Only now, when the device has work.
                 self._wait_for(check, generator, steps)
@@ -312,8 +310,6 @@ class CapturedRollout:
             results.append(worlds)
             if call.spec.keep_every is not None:
                 worlds = worlds.map(lambda value: value[-1])
-            if len(worlds.tensors()) < len(self._worlds.tensors()):
-                worlds = worlds.with_zero_paths(self._zero_paths)
             inputs = [*worlds.tensors(), *call.weights]
         if call.spec.keep_every is None or len(results) == 1:
             return results[-1]
@@ -331,11 +327,7 @@ class CapturedRollout:
             raise
 
     def forward(
-        self,
-        steps: int,
-        tensors: Sequence[Tensor],
-        generator: Randomness | None,
-        with_paths: bool = True,
+        self, steps: int, tensors: Sequence[Tensor], generator: Randomness | None
     ) -> list[Tensor]:
         """Replay a rollout, and return copies of the resulting worlds; not differentiable."""
         with torch.cuda.device(self.device):
@@ -345,7 +337,7 @@ class CapturedRollout:
             graphs = self.graphs[steps]
             self.graphs.move_to_end(steps)
             graphs.forward.replay()
-            return _copies(graphs.worlds if with_paths else graphs.worlds[:2])
+            return _copies(graphs.worlds)
 
     def backward(
         self, steps: int, cotangents: Sequence[Tensor | None], grad_flags: Sequence[bool]

@@ -71,9 +71,7 @@ def execute(
     Without a watch and path lengths it skips the steps after all worlds have come to rest.
     """
     if watch is not None or with_paths or not _can_rest(spec, rules, particles.x):
-        return run_all_steps(
-            spec, rules, particles, generator, cuda_graph, watch, with_paths=with_paths
-        )
+        return run_all_steps(spec, rules, particles, generator, cuda_graph, watch)
     remaining, steps = spec.steps, FIRST_PART[particles.x.device.type]
     while remaining and not resting(rules, particles, spec.physics, cuda_graph).all():
         part = spec._replace(steps=min(steps, remaining))
@@ -122,19 +120,14 @@ def run_all_steps(
     generator: Randomness | None,
     cuda_graph: CudaGraph,
     watch: DivergenceWatch | None = None,
-    *,
-    with_paths: bool = False,
 ) -> Particles:
     """Run all steps in the fastest way that the options allow; return the last worlds.
 
     With `spec.keep_every` it returns the worlds kept, stacked along a new first dimension. With a
-    watch, each step is launched and then checked for divergence. Without `with_paths` path lengths
-    may be None.
+    watch, each step is launched and then checked for divergence.
     """
     if watch is None:
-        replayed = run_captured(
-            spec, rules, particles, generator, cuda_graph=cuda_graph, with_paths=with_paths
-        )
+        replayed = run_captured(spec, rules, particles, generator, cuda_graph=cuda_graph)
         if replayed is not None:
             return replayed
     check_finite_positions(particles.x)

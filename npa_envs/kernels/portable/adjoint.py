@@ -61,18 +61,14 @@ def unscaling_kernel(space: SimpleNamespace, module: wp.Module, state_gradient: 
 
     @wp.func
     def unscaled(
-        perception: wp.array2d[scalar],
-        perception_bar: wp.array2d[scalar],
-        row: int,
-        from_row: int,
-        column: int,
+        perception: wp.array2d[scalar], bars: wp.array2d[scalar], row: int, at: int, column: int
     ):
-        """Return dL/dv of the vector v whose logarithmic scaling begins at `column`."""
+        """Return dL/dv of the vector v whose scaling begins at `column`; its bar is in row `at`."""
         scaled = vector()
         bar = vector()
         for d in range(wp.static(space_dim)):
             scaled[d] = perception[row, column + d]
-            bar[d] = perception_bar[from_row, column + d]
+            bar[d] = bars[at, column + d]
         return log_scale_adjoint(scaled, bar)
 
     @in_ranges(PAIRS)
@@ -102,17 +98,16 @@ def unscaling_kernel(space: SimpleNamespace, module: wp.Module, state_gradient: 
         row += range_start
         if row >= starts[starts.shape[0] - 1] - row_base:
             return
-        from_row = row
+        at = row
         if bar_row.shape[0] > 0:
-            from_row = bar_row[row]
+            at = bar_row[row]
         smoothed = scalar(0.0)
         gradient = vector()
         if channel < state_dim:
-            smoothed = perception_bar[from_row, state_dim + channel]
+            smoothed = perception_bar[at, state_dim + channel]
             if wp.static(state_gradient):
                 column = 2 * state_dim + channel * wp.static(space_dim)
-                along = unscaled(perception, perception_bar, row, from_row, column)
-                gradient = gradient_scale * along
+                gradient = gradient_scale * unscaled(perception, perception_bar, row, at, column)
         entry = row * group_count + channel / wp.static(width)
         c = channel % wp.static(width)
         smoothed_bar[entry * wp.static(width) + c] = smoothed
@@ -124,8 +119,7 @@ def unscaling_kernel(space: SimpleNamespace, module: wp.Module, state_gradient: 
                 column = 2 * state_dim
                 if wp.static(state_gradient):
                     column += state_dim * wp.static(space_dim)
-                along = unscaled(perception, perception_bar, row, from_row, column)
-                bar = density_scale * along
+                bar = density_scale * unscaled(perception, perception_bar, row, at, column)
             density_gradient_bar[row] = bar
 
     return unscale_cotangents
