@@ -289,7 +289,7 @@ def saved_together(
     if block is None:
         block = torch.empty(sum(sizes), dtype=torch.uint8, device=like.device)
     parts = {}
-    for name, count, part in zip(shapes, counts, block.split(sizes), strict=True):
+    for name, count, part in zip(shapes, counts, block.split_with_sizes(sizes), strict=True):
         numbers = part.view(torch.int32 if name in indices else like.dtype)
         parts[name] = numbers[:count].view(shapes[name])
     return block, SavedPerception(**parts)

@@ -254,10 +254,7 @@ def unscaling_kernel(space: SimpleNamespace, module: wp.Module, state_gradient: 
         # outputs
         cotangents: wp.array[FOUR_CHANNELS],
     ):
-        """Write dL/d(smoothed states) times `smoothed_scale`, and dL/d(state gradients).
-
-        The gradient by row k is in row `bar_row[k]`, if that is empty in row k.
-        """
+        """Write dL/d(smoothed states) times `smoothed_scale`, and dL/d(state gradients)."""
         wait_for_previous_kernel()
         allow_next_launch()
         thread = wp.tid()

@@ -90,10 +90,7 @@ def unscaling_kernel(space: SimpleNamespace, module: wp.Module, state_gradient: 
         gradient_bar: wp.array[scalar],
         density_gradient_bar: wp.array[vector],
     ):
-        """Write dL/d(smoothed states), dL/d(state gradients) and dL/d(density gradients).
-
-        The gradient by row k is in row `bar_row[k]`, if that is empty in row k.
-        """
+        """Write dL/d(smoothed states), dL/d(state gradients) and dL/d(density gradients)."""
         row, channel = wp.tid()
         row += range_start
         if row >= starts[starts.shape[0] - 1] - row_base:
