@@ -136,7 +136,7 @@ def scatter_splats(splats: Splats, view: Any) -> tuple[Tensor, Tensor, Tensor]:
     return picture, footprints, original_index
 
 
-@custom_op("npa::splat", of_all=True)
+@custom_op("npa::splat")
 def _splat(
     x: Tensor,
     colour: Tensor,
@@ -160,7 +160,7 @@ def _splat(
     return picture, footprints, original_index
 
 
-@custom_op("npa::splat_backward", of_all=True)
+@custom_op("npa::splat_backward")
 def _splat_backward(
     picture_bar: Tensor,
     footprints: Tensor,
