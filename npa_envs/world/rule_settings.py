@@ -29,10 +29,7 @@ OF_EVERY_MODULE = frozenset(vars(nn.Module()))
 
 
 def is_observed(rule: nn.Module) -> bool:
-    """Return whether more runs with a rule than its classes' `forward`, such as hooks.
-
-    A capture runs that only once, and on a copy of the rule.
-    """
+    """Return whether hooks or other Python code run with a rule besides its classes' `forward`."""
     return bool(_has_any_global_hook()) or any(  # type: ignore[no-untyped-call]
         "forward" in vars(module)
         or "_orig_mod" in module._modules
