@@ -32,10 +32,11 @@ from npa_envs.world.rule_settings import settings_and_weights
 if TYPE_CHECKING:
     from npa_envs.world.rollout_execution import RolloutSpec
 
-CudaGraph = bool | Literal["auto"]
-"""Which rollouts are captured on CUDA: those of plain rules ("auto"), all or none."""
+CudaGraph = bool | Literal["auto", "steps"]
+"""Which rollouts are captured on CUDA: those of plain rules ("auto"), all or none; "steps" is
+"auto" without whole rollouts in one kernel."""
 
-CUDA_GRAPH_CHOICES: tuple[CudaGraph, ...] = ("auto", True, False)
+CUDA_GRAPH_CHOICES: tuple[CudaGraph, ...] = ("auto", "steps", True, False)
 
 LAUNCHED_FIRST = 2
 """Number of calls of a group that are launched before the next one is captured."""

@@ -98,6 +98,34 @@ def draw_step(x: Tensor, physics: Physics, generator: Randomness | None) -> Draw
     return Draws(mask, noise)
 
 
+def draw_ahead(
+    x: Tensor, physics: Physics, steps: int, generator: Randomness | None
+) -> tuple[Tensor | None, Tensor | None]:
+    """Return the masks [T, B, N] and the noise [T, B, N, D] of `steps` calls of `draw_step`.
+
+    A `WorldRandom` draws all steps at once; `sync_with` of its copy is left to the caller.
+    """
+    if isinstance(generator, WorldRandom):
+        drawn = draw_step(x.expand(steps, *x.shape).flatten(0, 1), physics, generator)
+        mask, noise = drawn.mask, drawn.noise
+        shape = steps, *x.shape
+        return (
+            None if mask is None else mask.view(shape[:3]),
+            None if noise is None else noise.view(shape),
+        )
+    masks = noises = None
+    if physics.update_prob < 1.0:
+        masks = torch.empty(steps, *x.shape[:2], dtype=torch.uint8, device=x.device)
+    if physics.position_noise > 0.0:
+        noises = torch.empty(steps, *x.shape, dtype=x.dtype, device=x.device)
+    for step in range(steps):
+        if masks is not None:
+            masks[step].bernoulli_(physics.update_prob, generator=generator)
+        if noises is not None:
+            noises[step].normal_(generator=generator)
+    return masks, None if noises is None else noises.mul_(physics.position_noise)
+
+
 def skip_draws(x: Tensor, physics: Physics, steps: int, generator: Randomness | None) -> None:
     """Advance a generator as far as `steps` steps of worlds with positions x would."""
     if steps == 0:
