@@ -141,7 +141,9 @@ __device__ inline unsigned blocks_near(const float2* places, const Bounds& bound
             nearest = fminf(nearest, fmaf(dx, dx, dy * dy));
         }
     }
-    return __ballot_sync(~0u, nearest < distance * distance);
+    // Of places so far away, or not a number, squares and roundings say nothing.
+    if (!(width + height < 1e15f)) nearest = 0.0f;
+    return __ballot_sync(~0u, lane < N / 8 && nearest < distance * distance);
 }
 
 // Weights of both layers, scaled and split as `arrange_hidden` and `arrange_output` do it, in the order
@@ -297,8 +299,8 @@ template <int N, int WARPS, int CLUSTER, int BLOCKS> struct WorldGroup {
 
     __device__ void sync_in_block() const
     {
-        if constexpr (WARPS == 1) __syncwarp();
-        else asm volatile("bar.sync %0, %1;" :: "r"(number + 1), "n"(WARPS * 32) : "memory");
+        __syncwarp();
+        if constexpr (WARPS > 1) asm volatile("bar.sync %0, %1;" :: "r"(number + 1), "n"(WARPS * 32) : "memory");
     }
     __device__ void sync() const
     {
@@ -444,10 +446,10 @@ struct DensityPhase {
                 for (int c = 0; c < 4 / THREADS; ++c) {
                     const float4 two = block[side * 2 + c];
                     const float ax = two.x - p.x, ay = two.y - p.y, bx = two.z - p.x, by = two.w - p.y;
-                    const float a = smoothing(fmaf(ax, ax, ay * ay), inverse_squared);
-                    const float b = smoothing(fmaf(bx, bx, by * by), inverse_squared);
-                    sums[c / 2][0] += a;
-                    sums[c / 2][1] += b;
+                    const float a = falloff_within(fmaf(ax, ax, ay * ay), inverse_squared);
+                    const float b = falloff_within(fmaf(bx, bx, by * by), inverse_squared);
+                    sums[c / 2][0] = fmaf(a * a, a, sums[c / 2][0]);
+                    sums[c / 2][1] = fmaf(b * b, b, sums[c / 2][1]);
                 }
             }
             float density = sums[0][0] + sums[0][1];
@@ -493,11 +495,14 @@ template <int BLOCKS> struct Perception {
         float total[3][BLOCKS][4] = {};
         // Of each particle: sums of K, of v K, and of v K_x x, v K_x y and v K_y y.
         float sums[2][7] = {};
-        while (near) {
+        // The products of a pair of blocks run beside the weights of the next pair.
+        unsigned left[3][4], rest[3][4], at = 0u;
+        auto weigh = [&] {
             const int a = __ffs(near) - 1;
             near &= near - 1;
             const int b = near ? __ffs(near) - 1 : N / 8;
             near &= near - 1;
+            at = rows + (lane & 8 ? b : a) * (8 * ROW);
             float weight[3][2][2][2];
             #pragma unroll
             for (int q = 0; q < 2; ++q) {
@@ -527,30 +532,45 @@ template <int BLOCKS> struct Perception {
                     }
                 }
             }
+            #pragma unroll
+            for (int k = 0; k < 12; ++k)
+                split_half(weight[k / 4][k / 2 % 2][k % 2][0], weight[k / 4][k / 2 % 2][k % 2][1],
+                    left[k / 4][k % 4], rest[k / 4][k % 4]);
+        };
+        auto multiply = [&] {
             unsigned high[4], low[4];
-            const unsigned at = rows + (lane & 8 ? b : a) * (8 * ROW);
             load_transposed(high, at);
             if constexpr (BLOCKS == 2) load_transposed(low, at + 32);
+            // With one block the same load has its high and its low parts.
+            const unsigned* small = BLOCKS == 2 ? low : high + 2;
+            float product[3][BLOCKS][4] = {};
             #pragma unroll
-            for (int k = 0; k < 3; ++k) {
-                unsigned left[4], rest[4];
+            for (int block = 0; block < BLOCKS; ++block)
                 #pragma unroll
-                for (int q = 0; q < 2; ++q)
-                    #pragma unroll
-                    for (int r = 0; r < 2; ++r)
-                        split_half(weight[k][q][r][0], weight[k][q][r][1], left[2 * q + r], rest[2 * q + r]);
+                for (int k = 0; k < 3; ++k)
+                    multiply_half(product[k][block], rest[k], high[2 * block], high[2 * block + 1]);
+            #pragma unroll
+            for (int block = 0; block < BLOCKS; ++block)
                 #pragma unroll
-                for (int block = 0; block < BLOCKS; ++block) {
-                    // With one block the same load has its high and its low parts.
-                    const unsigned* small = BLOCKS == 2 ? low + 2 * block : high + 2;
-                    float product[4] = {};
-                    multiply_half(product, rest, high[2 * block], high[2 * block + 1]);
-                    multiply_half(product, left, small[0], small[1]);
-                    multiply_half(product, left, high[2 * block], high[2 * block + 1]);
-                    #pragma unroll
-                    for (int e = 0; e < 4; ++e) total[k][block][e] += product[e];
-                }
+                for (int k = 0; k < 3; ++k)
+                    multiply_half(product[k][block], left[k], small[2 * block], small[2 * block + 1]);
+            #pragma unroll
+            for (int block = 0; block < BLOCKS; ++block)
+                #pragma unroll
+                for (int k = 0; k < 3; ++k)
+                    multiply_half(product[k][block], left[k], high[2 * block], high[2 * block + 1]);
+            #pragma unroll
+            for (int k = 0; k < 12 * BLOCKS; ++k)
+                total[k / 4 / BLOCKS][k / 4 % BLOCKS][k % 4] += product[k / 4 / BLOCKS][k / 4 % BLOCKS][k % 4];
+        };
+        if (near) {
+            weigh();
+            #pragma unroll 1
+            while (near) {
+                multiply();
+                weigh();
             }
+            multiply();
         }
         const float unsharpen = 1.0f / (SHARPNESS * SHARPNESS);
         #pragma unroll
