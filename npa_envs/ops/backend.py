@@ -21,7 +21,7 @@ from npa_envs.kernels.cuda.density import MIN_SIDE
 from npa_envs.kernels.cuda.equivariance import fits_block
 from npa_envs.kernels.cuda.network import WARP_UNITS
 from npa_envs.kernels.cuda.sort import BLOCKS, MAX_GRID
-from npa_envs.kernels.cuda.whole_rollout import MAX_CHANNELS, SIZES
+from npa_envs.kernels.cuda.whole_rollout import MAX_CHANNELS, MIN_PARTICLES, SIZES
 from npa_envs.kernels.cuda.whole_rollout import fits_block as world_fits_block
 from npa_envs.ops.physics import Boundary
 
@@ -155,9 +155,9 @@ TABLE: tuple[Implementation, ...] = (
         "rollout",
         "whole",
         "kernels/cuda/whole_rollout.py",
-        "CUDA of compute capability 9.0, float32, 2D, no periodic box, worlds of at most "
-        f"{SIZES[-1]} particles with {MAX_CHANNELS} channels that fit into shared memory with the "
-        "rule: one launch runs all steps, and a few warps own a world",
+        "CUDA of compute capability 9.0, float32, 2D, no periodic box, worlds of "
+        f"{MIN_PARTICLES} to {SIZES[-1]} particles with at most {MAX_CHANNELS} channels that fit "
+        "into shared memory with the rule: one launch runs all steps, a few warps own a world",
         _whole,
     ),
     Implementation(

@@ -16,7 +16,7 @@ from npa_envs.kernels.cuda.whole_rollout import (
     world_size,
 )
 from npa_envs.ops.backend import multiprocessor_count
-from npa_envs.ops.launch import launch
+from npa_envs.ops.launch import aligned, launch
 from npa_envs.ops.physics import INVERSES, Physics
 
 SORT_INTERVAL = 16
@@ -60,7 +60,7 @@ def run_whole_rollout(
     `weights` are W1 [H, P], b1 [H] and W2 [A, H]. `masks` (uint8, [T, B, N]) has each step's active
     particles, None for all; `noise` [T, B, N, D] is added to positions.
     """
-    x, s = x.contiguous(), s.contiguous()
+    x, s = aligned(x), s.contiguous()
     world_count, particle_count, _ = x.shape
     multiprocessors = multiprocessor_count(x.device)
     hidden_weight, hidden_bias, output_weight = (weight.contiguous() for weight in weights)
@@ -69,33 +69,25 @@ def run_whole_rollout(
     terms, scale = physics.terms, physics.scale()
     gradient_column = 2 * state_dim
     density_column = gradient_column + 2 * state_dim * terms.state_gradient
-    new_x, new_s = torch.empty_like(x), torch.empty_like(s)
-    blocks = variant.cluster * min(world_count, multiprocessors // variant.cluster)
-    launch(
-        whole_rollout(variant),
-        blocks * variant.threads,
-        x.device,
-        steps,
-        SORT_INTERVAL,
+    numbers = (
         1.0 / physics.eps,
         physics.max_displacement * physics.dt,
         physics.dt,
         7.5 / physics.eps * scale,
         30.0 / math.pi / physics.eps**3 * scale**3 / particle_count,
+        *(physics.box or (1.0, 1.0)),
+    )
+    choices = (
+        steps,
+        SORT_INTERVAL,
         INVERSES.index(terms.correction),
         int(physics.boundary == "reflecting"),
-        physics.box or (1.0, 1.0),
         gradient_column if terms.state_gradient else -1,
         density_column if terms.density_gradient else -1,
-        hidden_weight,
-        hidden_bias,
-        output_weight,
-        masks,
-        noise,
-        x,
-        s,
-        new_x,
-        new_s,
-        block_dim=variant.threads,
     )
-    return new_x, new_s
+    tensors = hidden_weight, hidden_bias, output_weight, masks, noise, x, s
+    results = torch.empty_like(x), torch.empty_like(s)
+    blocks = variant.cluster * min(world_count, multiprocessors // variant.cluster)
+    threads, arguments = variant.threads, (numbers, choices, *tensors, *results)
+    launch(whole_rollout(variant), blocks * threads, x.device, *arguments, block_dim=threads)
+    return results

@@ -53,29 +53,34 @@ __device__ inline void load_transposed(unsigned (&parts)[4], unsigned address)
         : "=r"(parts[0]), "=r"(parts[1]), "=r"(parts[2]), "=r"(parts[3]) : "r"(address) : "memory");
 }
 
+__device__ inline float rsqrt_fast(float value)
+{
+    float result;
+    asm("rsqrt.approx.ftz.f32 %0, %1;" : "=f"(result) : "f"(value));
+    return result;
+}
+
+// Synchronize THREADS threads of a block, which use the same barrier.
+template <int THREADS> __device__ inline void sync_threads(int barrier)
+{
+    asm volatile("bar.sync %0, %1;" :: "r"(barrier), "n"(THREADS) : "memory");
+}
+
 // Writes to the shared memory of the cluster's other block.
-__device__ inline void put_far(unsigned address, uint4 v)
+template <typename Value> __device__ inline void put_far(unsigned address, const Value& value)
 {
-    asm volatile("st.shared::cluster.v4.u32 [%0], {%1, %2, %3, %4};"
-        :: "r"(address), "r"(v.x), "r"(v.y), "r"(v.z), "r"(v.w) : "memory");
-}
-__device__ inline void put_far(unsigned address, float4 v)
-{
-    asm volatile("st.shared::cluster.v4.f32 [%0], {%1, %2, %3, %4};"
-        :: "r"(address), "f"(v.x), "f"(v.y), "f"(v.z), "f"(v.w) : "memory");
-}
-__device__ inline void put_far(unsigned address, float2 v)
-{
-    asm volatile("st.shared::cluster.v2.f32 [%0], {%1, %2};"
-        :: "r"(address), "f"(v.x), "f"(v.y) : "memory");
-}
-__device__ inline void put_far(unsigned address, int v)
-{
-    asm volatile("st.shared::cluster.u32 [%0], %1;" :: "r"(address), "r"(v) : "memory");
-}
-__device__ inline void put_far(unsigned address, unsigned short v)
-{
-    asm volatile("st.shared::cluster.u16 [%0], %1;" :: "r"(address), "h"(v) : "memory");
+    const unsigned* words = reinterpret_cast<const unsigned*>(&value);
+    if constexpr (sizeof(Value) == 16) {
+        asm volatile("st.shared::cluster.v4.u32 [%0], {%1, %2, %3, %4};"
+            :: "r"(address), "r"(words[0]), "r"(words[1]), "r"(words[2]), "r"(words[3]) : "memory");
+    } else if constexpr (sizeof(Value) == 8) {
+        asm volatile("st.shared::cluster.v2.u32 [%0], {%1, %2};"
+            :: "r"(address), "r"(words[0]), "r"(words[1]) : "memory");
+    } else if constexpr (sizeof(Value) == 4) {
+        asm volatile("st.shared::cluster.u32 [%0], %1;" :: "r"(address), "r"(words[0]) : "memory");
+    } else {
+        asm volatile("st.shared::cluster.u16 [%0], %1;" :: "r"(address), "h"(value) : "memory");
+    }
 }
 
 // Place of a cell on Hilbert's curve of 256 x 256 cells.
@@ -300,7 +305,7 @@ template <int N, int WARPS, int CLUSTER, int BLOCKS> struct WorldGroup {
     __device__ void sync_in_block() const
     {
         __syncwarp();
-        if constexpr (WARPS > 1) asm volatile("bar.sync %0, %1;" :: "r"(number + 1), "n"(WARPS * 32) : "memory");
+        if constexpr (WARPS > 1) sync_threads<WARPS * 32>(number + 1);
     }
     __device__ void sync() const
     {
@@ -364,12 +369,14 @@ __device__ inline void sort_world(const Group& group, int step, int count, float
     group.sync_in_block();
 }
 
-// Constants of a rollout.
+// Constants of a rollout, in the order in which `run_whole_rollout` gives them.
 struct RolloutNumbers {
-    float inverse_eps, reach, dt, gradient_scale, density_scale;
+    float inverse_eps, reach, dt, gradient_scale, density_scale, side_x, side_y;
+};
+struct RolloutChoices {
+    int steps, sort_interval;
     int inverse;  // 0: no correction of gradients; 1: the inverse with a threshold; 2: the smooth one.
-    int reflecting;
-    float side_x, side_y;
+    int reflecting, gradient_column, density_column;
 };
 
 // Densities of a warp's share of the particles, rows for their neighbours, the list of active ones.
@@ -397,7 +404,7 @@ struct DensityPhase {
 
     // Returns the number of active particles. `noise` [N, 2] is in the caller's order, or null.
     __device__ int run(
-        const Group& group, const RolloutNumbers& numbers, int step, int count,
+        const Group& group, const RolloutNumbers& numbers, const RolloutChoices& choices, int step, int count,
         float reach, float state_scale, const float2* noise)
     {
         const int lane = threadIdx.x & 31;
@@ -426,7 +433,7 @@ struct DensityPhase {
                 if (ballots[pass] >> lane & 1u) {
                     const int rank = first[pass] + __popc(ballots[pass] & ((1u << lane) - 1u));
                     group.put(&group.active()[rank], (unsigned short)i);
-                } else if (numbers.reflecting && i < count) {
+                } else if (choices.reflecting && i < count) {
                     next = make_float2(mirrored(next.x, numbers.side_x), mirrored(next.y, numbers.side_y));
                 }
                 group.put(&group.places(step + 1)[i], next);
@@ -484,8 +491,8 @@ template <int BLOCKS> struct Perception {
 
     template <int N, typename Group>
     __device__ void sum(
-        const Group& group, const RolloutNumbers& numbers, const int (&index)[2], const float2 (&p)[2],
-        unsigned near, float state_unscale)
+        const Group& group, const RolloutNumbers& numbers, const RolloutChoices& choices,
+        const int (&index)[2], const float2 (&p)[2], unsigned near, float state_unscale)
     {
         const int lane = threadIdx.x & 31, t = lane & 3;
         constexpr int ROW = Group::Memory::ROW;
@@ -514,8 +521,7 @@ template <int BLOCKS> struct Perception {
                     for (int r = 0; r < 2; ++r) {
                         const float x = other.x - p[r].x, y = other.y - p[r].y;
                         const float squared = fmaf(x, x, fmaf(y, y, 1.2e-38f));
-                        float inverse;
-                        asm("rsqrt.approx.ftz.f32 %0, %1;" : "=f"(inverse) : "f"(squared));
+                        const float inverse = rsqrt_fast(squared);
                         const float falloff = fmaxf(fmaf(squared * inverse, slope, SHARPNESS), 0.0f);
                         const float factor = falloff * falloff * inverse;
                         const float kx = factor * x, ky = factor * y, vx = other.z * kx, vy = other.z * ky;
@@ -584,12 +590,12 @@ template <int BLOCKS> struct Perception {
             const float xx = sums[r][4] * moment_scale, xy = sums[r][5] * moment_scale, yy = sums[r][6] * moment_scale;
             const float determinant = fmaf(xx, yy, -xy * xy);
             float ixx = 1.0f, ixy = 0.0f, iyy = 1.0f;
-            if (numbers.inverse == 1 && fabsf(determinant) >= 1e-3f) {
+            if (choices.inverse == 1 && fabsf(determinant) >= 1e-3f) {
                 const float quotient = 1.0f / determinant;
                 ixx = yy * quotient;
                 ixy = -xy * quotient;
                 iyy = xx * quotient;
-            } else if (numbers.inverse == 2) {
+            } else if (choices.inverse == 2) {
                 // (det M adj M + τ² I) / (det² M + τ²), τ = 0.01.
                 const float quotient = 1.0f / fmaf(determinant, determinant, 1e-4f);
                 ixx = fmaf(determinant, yy, 1e-4f) * quotient;
@@ -734,30 +740,29 @@ template <int BLOCKS> struct Updates {
 
 template <int N, int WARPS, int CLUSTER, int BLOCKS, typename Tile>
 __device__ inline void roll_worlds(
-    const Tile& memory, int steps, int sort_interval, float inverse_eps, float reach_of_step, float dt,
-    float gradient_scale, float density_scale, int inverse, int reflecting, wp::vec_t<2, float> box,
-    int gradient_column, int density_column, const wp::array_t<float>& hidden, const wp::array_t<float>& bias,
-    const wp::array_t<float>& output, const wp::array_t<unsigned char>& masks, const wp::array_t<float>& noise,
-    const wp::array_t<float>& x, const wp::array_t<float>& s, const wp::array_t<float>& new_x,
-    const wp::array_t<float>& new_s)
+    const Tile& memory, const wp::vec_t<7, float>& number_list, const wp::vec_t<6, int>& choice_list,
+    const wp::array_t<float>& hidden, const wp::array_t<float>& bias, const wp::array_t<float>& output,
+    const wp::array_t<unsigned char>& masks, const wp::array_t<float>& noise, const wp::array_t<float>& x,
+    const wp::array_t<float>& s, const wp::array_t<float>& new_x, const wp::array_t<float>& new_s)
 {
     using Group = WorldGroup<N, WARPS, CLUSTER, BLOCKS>;
     unsigned char* shared = reinterpret_cast<unsigned char*>(memory.data.ptr);
-    const RolloutNumbers numbers = {
-        inverse_eps, reach_of_step, dt, gradient_scale, density_scale, inverse, reflecting, box[0], box[1]};
+    const RolloutNumbers numbers = reinterpret_cast<const RolloutNumbers&>(number_list);
+    const RolloutChoices choices = reinterpret_cast<const RolloutChoices&>(choice_list);
+    const int steps = choices.steps, sort_interval = choices.sort_interval;
     const int units = (hidden.shape[0] + 31) / 32 * 2, world_count = x.shape[0], count = x.shape[1];
     const int state_dim = s.shape[2], groups = blockDim.x / 32 / WARPS;
     const int lane = threadIdx.x & 31, g = lane >> 2, t = lane & 3, thread = threadIdx.x % (WARPS * 32);
     unsigned char* worlds = shared + NetworkMemory<BLOCKS>(units).bytes;
-    arrange_network<BLOCKS>(shared, reinterpret_cast<float*>(worlds), units, state_dim, gradient_column,
-        density_column, hidden, bias, output);
+    arrange_network<BLOCKS>(shared, reinterpret_cast<float*>(worlds), units, state_dim,
+        choices.gradient_column, choices.density_column, hidden, bias, output);
     __syncthreads();
     const Group group(worlds);
-    // Rows and places that fill up the last pair of blocks.
-    for (int k = thread; k < 8 * Group::Memory::ROW / 4; k += WARPS * 32)
-        reinterpret_cast<unsigned*>(group.row(N))[k] = 0u;
+    // Rows and places that fill up the last pair of blocks; each row by one thread.
     if (thread < 8) {
-        reinterpret_cast<float4*>(group.row(N + thread) + 32 * BLOCKS)[0] = make_float4(FAR_AWAY, FAR_AWAY, 0.0f, 0.0f);
+        unsigned* row = reinterpret_cast<unsigned*>(group.row(N + thread));
+        for (int k = 0; k < 8 * BLOCKS; ++k) row[k] = 0u;
+        reinterpret_cast<float4*>(row + 8 * BLOCKS)[0] = make_float4(FAR_AWAY, FAR_AWAY, 0.0f, 0.0f);
         group.places(0)[N + thread] = group.places(1)[N + thread] = make_float2(FAR_AWAY, FAR_AWAY);
     }
     const float reach = 1.00001f / numbers.inverse_eps;
@@ -798,7 +803,7 @@ __device__ inline void roll_worlds(
             const unsigned exponent = min(max(*group.largest() >> 23, 40u), 250u);
             const float state_scale = __uint_as_float((268u - exponent) << 23);
             const float state_unscale = __uint_as_float((exponent - 14u) << 23);
-            const int total = density.run(group, numbers, step, count, reach, state_scale,
+            const int total = density.run(group, numbers, choices, step, count, reach, state_scale,
                 moved ? moved + step * particles : nullptr);
             if (step + 1 < steps && (step + 1) % sort_interval != 0)
                 density.draw(group, step + 1, count, mask ? mask + (step + 1) * particles : nullptr);
@@ -824,7 +829,7 @@ __device__ inline void roll_worlds(
                 {
                     Perception<BLOCKS> seen;
                     seen.template sum<N>(
-                        group, numbers, index, p, blocks_near<N>(places, bounds, reach), state_unscale);
+                        group, numbers, choices, index, p, blocks_near<N>(places, bounds, reach), state_unscale);
                     updates.compute(seen, shared, units);
                 }
                 #pragma unroll
@@ -836,7 +841,7 @@ __device__ inline void roll_worlds(
                         float2 place = next[index[r]];
                         place.x = fmaf(length, ax, place.x);
                         place.y = fmaf(length, ay, place.y);
-                        if (numbers.reflecting) {
+                        if (choices.reflecting) {
                             place.x = mirrored(place.x, numbers.side_x);
                             place.y = mirrored(place.y, numbers.side_y);
                         }

@@ -16,6 +16,9 @@ SHARED_BYTES = 225 * 1024
 SIZES = (64, 128, 256)
 """Numbers of particles that worlds are filled up to."""
 
+MIN_PARTICLES = 32
+"""Minimum number of particles: the fewer there are, the larger is a density gradient's rounding."""
+
 MAX_CHANNELS = 16
 """Maximum number of state channels."""
 
@@ -54,7 +57,7 @@ def world_size(particle_count: int) -> int:
 
 def fits_block(particle_count: int, state_dim: int, hidden_dim: int) -> bool:
     """Return whether enough worlds of these sizes, with their rule, fit into shared memory."""
-    if particle_count > SIZES[-1] or state_dim > MAX_CHANNELS:
+    if not MIN_PARTICLES <= particle_count <= SIZES[-1] or state_dim > MAX_CHANNELS:
         return False
     size = world_size(particle_count)
     shared = WorldVariant(size, 1, 1, 2 * SIZES[-1] // size, channel_blocks(state_dim))
@@ -74,25 +77,14 @@ def whole_rollout(variant: WorldVariant) -> wp.Kernel:
     roll_worlds = native.function(
         "roll_worlds",
         *(size, warps, cluster, channel_blocks),
-        untyped="memory steps sort_interval inverse_eps reach dt gradient_scale density_scale "
-        "inverse reflecting box gradient_column density_column hidden_weight hidden_bias "
-        "output_weight masks noise x s new_x new_s",
+        untyped="memory numbers choices hidden_weight hidden_bias output_weight masks noise x s "
+        "new_x new_s",
     )
 
     @wp.kernel(module=native.module(name), launch_bounds=(variant.threads, 1), cluster_dim=cluster)
     def roll_out_worlds(
-        steps: int,
-        sort_interval: int,
-        inverse_eps: float,
-        reach: float,
-        dt: float,
-        gradient_scale: float,
-        density_scale: float,
-        inverse: int,
-        reflecting: int,
-        box: wp.vec2,
-        gradient_column: int,
-        density_column: int,
+        numbers: wp.types.vector(7, wp.float32),
+        choices: wp.types.vector(6, wp.int32),
         hidden_weight: wp.array2d[wp.float32],
         hidden_bias: wp.array[wp.float32],
         output_weight: wp.array2d[wp.float32],
@@ -108,18 +100,8 @@ def whole_rollout(variant: WorldVariant) -> wp.Kernel:
         memory = wp.tile_empty(shape=(wp.static(SHARED_BYTES // 4),), dtype=float, storage="shared")
         roll_worlds(
             memory,
-            steps,
-            sort_interval,
-            inverse_eps,
-            reach,
-            dt,
-            gradient_scale,
-            density_scale,
-            inverse,
-            reflecting,
-            box,
-            gradient_column,
-            density_column,
+            numbers,
+            choices,
             hidden_weight,
             hidden_bias,
             output_weight,
