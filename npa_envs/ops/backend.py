@@ -155,9 +155,9 @@ TABLE: tuple[Implementation, ...] = (
         "rollout",
         "whole",
         "kernels/cuda/whole_rollout.py",
-        "CUDA of compute capability 9.0, float32, 2D, no periodic box, worlds of "
-        f"{MIN_PARTICLES} to {SIZES[-1]} particles with at most {MAX_CHANNELS} channels that fit "
-        "into shared memory with the rule: one launch runs all steps, a few warps own a world",
+        "cuda_graph='whole', CUDA of compute capability 9.0, float32, 2D, no periodic box, "
+        f"{MIN_PARTICLES} to {SIZES[-1]} particles with at most {MAX_CHANNELS} channels, worlds "
+        "that fit into shared memory with the rule: a few warps run all steps of a world",
         _whole,
     ),
     Implementation(

@@ -32,11 +32,11 @@ from npa_envs.world.rule_settings import settings_and_weights
 if TYPE_CHECKING:
     from npa_envs.world.rollout_execution import RolloutSpec
 
-CudaGraph = bool | Literal["auto", "steps"]
-"""Which rollouts are captured on CUDA: those of plain rules ("auto"), all or none; "steps" is
-"auto" without whole rollouts in one kernel."""
+CudaGraph = bool | Literal["auto", "whole"]
+"""Which rollouts are captured on CUDA: those of plain rules ("auto"), all or none. "whole" is
+"auto", but one kernel runs all steps of small worlds."""
 
-CUDA_GRAPH_CHOICES: tuple[CudaGraph, ...] = ("auto", "steps", True, False)
+CUDA_GRAPH_CHOICES: tuple[CudaGraph, ...] = ("auto", "whole", True, False)
 
 LAUNCHED_FIRST = 2
 """Number of calls of a group that are launched before the next one is captured."""

@@ -225,7 +225,8 @@ def rollout(
             That takes a tenth of the CPU time, and results are the same. "auto" captures plain
             rules, from the third call with the same shapes and options on. True also captures rules
             with a custom network, whose Python code then no longer runs; False captures nothing:
-            see docs/performance.md.
+            see docs/performance.md. "whole" is "auto", but one kernel runs all steps of many small
+            worlds, with other roundings: see `npa_envs/ops/backend.py`.
         return_path_length: Also return the length of each particle's path.
 
     Returns:

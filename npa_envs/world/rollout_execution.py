@@ -73,7 +73,7 @@ def execute(
     Without a watch and path lengths one kernel may run all steps, or it skips the steps after all
     worlds have come to rest.
     """
-    if watch is None and not with_paths and cuda_graph not in (False, "steps"):
+    if watch is None and not with_paths and cuda_graph == "whole":
         whole = run_whole(spec, rules, particles, generator)
         if whole is not None:
             return whole
