@@ -54,9 +54,10 @@ def run_whole(
 ) -> Particles | None:
     """Run a checked rollout in one launch; None: its steps have to be launched."""
     request = rollout_request(spec, rules, particles.x)
-    if request is None or _needs_gradients(rules, particles):
+    if request is None or choose("rollout", request).name != "whole":
         return None
-    if choose("rollout", request).name != "whole":
+    tensors = (*particles.tensors(), *rules[0].network_weights())
+    if torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors):
         return None
     x, s, *_ = particles
     capturing = torch.cuda.is_current_stream_capturing()
@@ -83,11 +84,6 @@ def run_whole(
                 assert isinstance(source, WorldRandom)
                 generator.sync_with(source, steps)
     return particles.with_fields(x=x, s=s)
-
-
-def _needs_gradients(rules: Sequence[NPARule], particles: Particles) -> bool:
-    tensors = (*particles.tensors(), *rules[0].network_weights())
-    return torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors)
 
 
 def _check_positions(

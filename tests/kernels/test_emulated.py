@@ -31,12 +31,12 @@ def function_of(text, name):
     return re.search(head + r"(?:\{[^\n]*\}\n|\{\n.*?\n\}\n)", text, re.S)[0]
 
 
-def printed_by(source, folder, includes):
+def printed_by(source, folder, includes, optimise="-O1"):
     """Return what a C++ program prints; it is compiled and runs in `folder`."""
     compiler = shutil.which("g++")
     if compiler is None:
         pytest.skip("needs g++")
-    options = ["-std=c++20", "-O1", "-w", *(f"-I{path}" for path in (HERE, folder, includes))]
+    options = ["-std=c++20", optimise, "-w", *(f"-I{path}" for path in (HERE, folder, includes))]
     command = [compiler, *options, "-o", "program", str(HERE / source)]
     subprocess.run(command, cwd=folder, check=True)
     program = [str(folder / "program")]
@@ -204,7 +204,7 @@ def test_whole_rollouts_are_those_of_the_reference(
     rollouts = without(text_of("cuda/whole_rollout.cuh"), *replaced)
     head = "namespace npa {\n" + rounded_exactly("\n".join(needed)) + "}\n"
     (tmp_path / "native.h").write_text(head + rollouts, encoding="utf-8")
-    printed_by("worlds_on_cpu.cpp", tmp_path, KERNELS)
+    printed_by("worlds_on_cpu.cpp", tmp_path, KERNELS, "-O0")
 
     values = torch.from_numpy(np.fromfile(tmp_path / "out", np.float32))
     new_x, new_s = values.split([x.numel(), s.numel()])

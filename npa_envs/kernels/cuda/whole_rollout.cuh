@@ -29,14 +29,8 @@ template <int BLOCKS> struct NetworkMemory {
     int hidden, extra, output, move, unscale, bytes;
 
     __device__ NetworkMemory(int units)
-    {
-        hidden = 0;
-        extra = hidden + units * 2048 * BLOCKS;
-        output = extra + units * 256;
-        move = output + units * 512 * BLOCKS;
-        unscale = move + units * 256;
-        bytes = unscale + 128;
-    }
+        : hidden(0), extra(units * 2048 * BLOCKS), output(extra + units * 256),
+          move(output + units * 512 * BLOCKS), unscale(move + units * 256), bytes(unscale + 128) {}
 };
 
 __device__ inline void multiply_half8(float (&sum)[4], const unsigned (&a)[2], unsigned b)
@@ -73,13 +67,11 @@ template <typename Value> __device__ inline void put_far(unsigned address, const
     if constexpr (sizeof(Value) == 16) {
         asm volatile("st.shared::cluster.v4.u32 [%0], {%1, %2, %3, %4};"
             :: "r"(address), "r"(words[0]), "r"(words[1]), "r"(words[2]), "r"(words[3]) : "memory");
-    } else if constexpr (sizeof(Value) == 8) {
-        asm volatile("st.shared::cluster.v2.u32 [%0], {%1, %2};"
-            :: "r"(address), "r"(words[0]), "r"(words[1]) : "memory");
-    } else if constexpr (sizeof(Value) == 4) {
-        asm volatile("st.shared::cluster.u32 [%0], %1;" :: "r"(address), "r"(words[0]) : "memory");
-    } else {
+    } else if constexpr (sizeof(Value) == 2) {
         asm volatile("st.shared::cluster.u16 [%0], %1;" :: "r"(address), "h"(value) : "memory");
+    } else {
+        for (unsigned k = 0; k < sizeof(Value) / 4; ++k)
+            asm volatile("st.shared::cluster.u32 [%0], %1;" :: "r"(address + 4 * k), "r"(words[k]) : "memory");
     }
 }
 
@@ -93,9 +85,7 @@ __device__ inline unsigned hilbert_place(unsigned x, unsigned y)
         place += bit * bit * ((3 * right) ^ up);
         if (!up) {
             if (right) { x = 255 - x; y = 255 - y; }
-            const unsigned swap = x;
-            x = y;
-            y = swap;
+            const unsigned swap = x; x = y; y = swap;
         }
     }
     return place;
@@ -139,11 +129,9 @@ __device__ inline unsigned blocks_near(const float2* places, const Bounds& bound
         for (int c = 0; c < 4; ++c) {
             // In another order in each lane, which avoids bank conflicts.
             const float4 two = reinterpret_cast<const float4*>(places)[lane * 4 + ((c + (lane >> 1)) & 3)];
-            float dx = fmaxf(fabsf(two.x - x) - width, 0.0f), dy = fmaxf(fabsf(two.y - y) - height, 0.0f);
-            nearest = fminf(nearest, fmaf(dx, dx, dy * dy));
-            dx = fmaxf(fabsf(two.z - x) - width, 0.0f);
-            dy = fmaxf(fabsf(two.w - y) - height, 0.0f);
-            nearest = fminf(nearest, fmaf(dx, dx, dy * dy));
+            const float ax = fmaxf(fabsf(two.x - x) - width, 0.0f), ay = fmaxf(fabsf(two.y - y) - height, 0.0f);
+            const float bx = fmaxf(fabsf(two.z - x) - width, 0.0f), by = fmaxf(fabsf(two.w - y) - height, 0.0f);
+            nearest = fminf(nearest, fminf(fmaf(ax, ax, ay * ay), fmaf(bx, bx, by * by)));
         }
     }
     // Of places so far away, or not a number, squares and roundings say nothing.
@@ -254,8 +242,7 @@ template <int N, int WARPS, int CLUSTER, int BLOCKS> struct WorldGroup {
     {
         number = (threadIdx.x >> 5) / WARPS;
         base = groups + number * Memory::bytes;
-        rank = 0;
-        across = 0;
+        rank = across = 0;
         if constexpr (CLUSTER == 2) {
             rank = blockIdx.x & 1;
             const unsigned own = (unsigned)__cvta_generic_to_shared(base);
@@ -446,12 +433,23 @@ struct DensityPhase {
             unsigned near = blocks_near<N>(places, bounds, reach);
             // Sums over halves of blocks, as two threads of a particle have them.
             float sums[2][2] = {};
+            float4 pairs[4 / THREADS];
+            auto fetch = [&] {
+                const int block = near ? __ffs(near) - 1 : N / 8;
+                #pragma unroll
+                for (int c = 0; c < 4 / THREADS; ++c)
+                    pairs[c] = reinterpret_cast<const float4*>(places)[block * 4 + side * 2 + c];
+            };
+            fetch();
             while (near) {
-                const float4* block = reinterpret_cast<const float4*>(places) + (__ffs(near) - 1) * 4;
                 near &= near - 1;
+                float4 now[4 / THREADS];
+                #pragma unroll
+                for (int c = 0; c < 4 / THREADS; ++c) now[c] = pairs[c];
+                fetch();
                 #pragma unroll
                 for (int c = 0; c < 4 / THREADS; ++c) {
-                    const float4 two = block[side * 2 + c];
+                    const float4 two = now[c];
                     const float ax = two.x - p.x, ay = two.y - p.y, bx = two.z - p.x, by = two.w - p.y;
                     const float a = falloff_within(fmaf(ax, ax, ay * ay), inverse_squared);
                     const float b = falloff_within(fmaf(bx, bx, by * by), inverse_squared);
@@ -503,20 +501,27 @@ template <int BLOCKS> struct Perception {
         // Of each particle: sums of K, of v K, and of v K_x x, v K_x y and v K_y y.
         float sums[2][7] = {};
         // The products of a pair of blocks run beside the weights of the next pair.
-        unsigned left[3][4], rest[3][4], at = 0u;
-        auto weigh = [&] {
+        unsigned left[3][4], rest[3][4], at = 0u, next = 0u;
+        float4 neighbours[2][2];
+        auto fetch = [&] {
             const int a = __ffs(near) - 1;
             near &= near - 1;
             const int b = near ? __ffs(near) - 1 : N / 8;
             near &= near - 1;
-            at = rows + (lane & 8 ? b : a) * (8 * ROW);
+            next = rows + (lane & 8 ? b : a) * (8 * ROW);
+            #pragma unroll
+            for (int k = 0; k < 4; ++k)
+                neighbours[k / 2][k % 2] = *reinterpret_cast<const float4*>(
+                    group.row((k / 2 ? b : a) * 8 + 2 * t + k % 2) + 32 * BLOCKS);
+        };
+        auto weigh = [&] {
+            at = next;
             float weight[3][2][2][2];
             #pragma unroll
             for (int q = 0; q < 2; ++q) {
                 #pragma unroll
                 for (int e = 0; e < 2; ++e) {
-                    const int j = (q ? b : a) * 8 + 2 * t + e;
-                    const float4 other = *reinterpret_cast<const float4*>(group.row(j) + 32 * BLOCKS);
+                    const float4 other = neighbours[q][e];
                     #pragma unroll
                     for (int r = 0; r < 2; ++r) {
                         const float x = other.x - p[r].x, y = other.y - p[r].y;
@@ -525,10 +530,8 @@ template <int BLOCKS> struct Perception {
                         const float falloff = fmaxf(fmaf(squared * inverse, slope, SHARPNESS), 0.0f);
                         const float factor = falloff * falloff * inverse;
                         const float kx = factor * x, ky = factor * y, vx = other.z * kx, vy = other.z * ky;
-                        sums[r][0] += kx;
-                        sums[r][1] += ky;
-                        sums[r][2] += vx;
-                        sums[r][3] += vy;
+                        sums[r][0] += kx; sums[r][1] += ky;
+                        sums[r][2] += vx; sums[r][3] += vy;
                         sums[r][4] = fmaf(vx, x, sums[r][4]);
                         sums[r][5] = fmaf(vx, y, sums[r][5]);
                         sums[r][6] = fmaf(vy, y, sums[r][6]);
@@ -550,29 +553,24 @@ template <int BLOCKS> struct Perception {
             // With one block the same load has its high and its low parts.
             const unsigned* small = BLOCKS == 2 ? low : high + 2;
             float product[3][BLOCKS][4] = {};
-            #pragma unroll
-            for (int block = 0; block < BLOCKS; ++block)
+            auto add = [&](const unsigned (&weights)[3][4], const unsigned* states) {
                 #pragma unroll
-                for (int k = 0; k < 3; ++k)
-                    multiply_half(product[k][block], rest[k], high[2 * block], high[2 * block + 1]);
-            #pragma unroll
-            for (int block = 0; block < BLOCKS; ++block)
-                #pragma unroll
-                for (int k = 0; k < 3; ++k)
-                    multiply_half(product[k][block], left[k], small[2 * block], small[2 * block + 1]);
-            #pragma unroll
-            for (int block = 0; block < BLOCKS; ++block)
-                #pragma unroll
-                for (int k = 0; k < 3; ++k)
-                    multiply_half(product[k][block], left[k], high[2 * block], high[2 * block + 1]);
+                for (int k = 0; k < 3 * BLOCKS; ++k)
+                    multiply_half(product[k % 3][k / 3], weights[k % 3], states[k / 3 * 2], states[k / 3 * 2 + 1]);
+            };
+            add(rest, high);
+            add(left, small);
+            add(left, high);
             #pragma unroll
             for (int k = 0; k < 12 * BLOCKS; ++k)
                 total[k / 4 / BLOCKS][k / 4 % BLOCKS][k % 4] += product[k / 4 / BLOCKS][k / 4 % BLOCKS][k % 4];
         };
         if (near) {
+            fetch();
             weigh();
             #pragma unroll 1
             while (near) {
+                fetch();
                 multiply();
                 weigh();
             }
@@ -592,9 +590,7 @@ template <int BLOCKS> struct Perception {
             float ixx = 1.0f, ixy = 0.0f, iyy = 1.0f;
             if (choices.inverse == 1 && fabsf(determinant) >= 1e-3f) {
                 const float quotient = 1.0f / determinant;
-                ixx = yy * quotient;
-                ixy = -xy * quotient;
-                iyy = xx * quotient;
+                ixx = yy * quotient; ixy = -xy * quotient; iyy = xx * quotient;
             } else if (choices.inverse == 2) {
                 // (det M adj M + τ² I) / (det² M + τ²), τ = 0.01.
                 const float quotient = 1.0f / fmaf(determinant, determinant, 1e-4f);
@@ -622,8 +618,7 @@ template <int BLOCKS> struct Perception {
             const float density_scale = numbers.density_scale * unsharpen;
             const float x = sums[r][0] * density_scale, y = sums[r][1] * density_scale;
             const float shorter = log_scale_of_square(fmaf(x, x, y * y));
-            density[r][0] = x * shorter;
-            density[r][1] = y * shorter;
+            density[r][0] = x * shorter; density[r][1] = y * shorter;
         }
     }
 };
