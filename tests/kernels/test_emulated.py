@@ -163,10 +163,10 @@ def exact_rollout(x, s, rule, masks, noise, side):
 @pytest.mark.parametrize(
     ("particles", "channels", "warps", "groups", "moment_inverse", "side"),
     [
-        (60, 16, 1, 3, "threshold", None),
-        (100, 5, 2, 1, "smooth", None),
+        pytest.param(60, 16, 1, 3, "threshold", None, marks=pytest.mark.slow),
+        pytest.param(100, 5, 2, 1, "smooth", None, marks=pytest.mark.slow),
         (200, 16, 4, 1, "threshold", 0.3),
-        (128, 16, 8, 1, "threshold", None),
+        pytest.param(128, 16, 8, 1, "threshold", None, marks=pytest.mark.slow),
     ],
 )
 def test_whole_rollouts_are_those_of_the_reference(

@@ -26,11 +26,11 @@ template <int N, int BLOCKS> struct WorldMemory {
 
 // Parts of the weights in shared memory, of `units` groups of 16 hidden units.
 template <int BLOCKS> struct NetworkMemory {
-    int hidden, extra, output, move, unscale, bytes;
+    int hidden, extra, output, unscale, bytes;
 
     __device__ NetworkMemory(int units)
         : hidden(0), extra(units * 2048 * BLOCKS), output(extra + units * 256),
-          move(output + units * 512 * BLOCKS), unscale(move + units * 256), bytes(unscale + 128) {}
+          unscale(output + units * 512 * (BLOCKS + 1)), bytes(unscale + 128) {}
 };
 
 __device__ inline void multiply_half8(float (&sum)[4], const unsigned (&a)[2], unsigned b)
@@ -142,6 +142,7 @@ __device__ inline unsigned blocks_near(const float2* places, const Bounds& bound
 // Weights of both layers, scaled and split as `arrange_hidden` and `arrange_output` do it, in the order
 // in which `perceive_and_update` reads them. Groups of 8 columns of rows are states, smoothed
 // states, x and y components of gradients. The extra columns are the density gradient and the bias.
+// Outputs are changes of states, filled up to a multiple of 8, then the two coordinates of δ.
 template <int BLOCKS>
 __device__ inline void arrange_network(
     unsigned char* shared, float* scales, int units, int state_dim, int gradient_column,
@@ -161,10 +162,14 @@ __device__ inline void arrange_network(
     }
     __syncthreads();
     float* unscale = reinterpret_cast<float*>(shared + memory.unscale);
-    for (int column = warp; column < 2 + 8 * BLOCKS; column += warps) {
+    auto weight_of_output = [&](int column, int unit) {
+        const int move = column - 8 * BLOCKS, row = move < 0 ? column + 2 : move < 2 ? move : output.shape[0];
+        if (unit >= hidden_dim || row >= output.shape[0]) return 0.0f;
+        return output.data[(size_t)row * hidden_dim + unit] / scales[unit];
+    };
+    for (int column = warp; column < 8 * BLOCKS + 8; column += warps) {
         float size = 0.0f;
-        for (int unit = lane; column < output.shape[0] && unit < hidden_dim; unit += 32)
-            size = fmaxf(size, fabsf(output.data[(size_t)column * hidden_dim + unit]) / scales[unit]);
+        for (int unit = lane; unit < hidden_dim; unit += 32) size = fmaxf(size, fabsf(weight_of_output(column, unit)));
         #pragma unroll
         for (int bit = 1; bit < 32; bit *= 2) size = fmaxf(size, __shfl_xor_sync(~0u, size, bit));
         if (lane == 0) unscale[column] = 1.0f / scale_to(size, 7);
@@ -179,10 +184,6 @@ __device__ inline void arrange_network(
         const int kind = block / BLOCKS, c = block % BLOCKS * 8 + channel;
         if (c >= state_dim || (kind >= 2 && gradient_column < 0)) return -1;
         return kind < 2 ? kind * state_dim + c : gradient_column + 2 * c + kind - 2;
-    };
-    auto layer2 = [&](int column, int unit) {
-        if (unit >= hidden_dim || column >= output.shape[0]) return 0.0f;
-        return output.data[(size_t)column * hidden_dim + unit] / scales[unit] / unscale[column];
     };
     unsigned* words = reinterpret_cast<unsigned*>(shared + memory.hidden);
     for (int k = threadIdx.x; k < units * 256 * BLOCKS; k += blockDim.x) {
@@ -206,19 +207,12 @@ __device__ inline void arrange_network(
             : t == 2 ? __byte_perm(high, low, 0x5432) : __byte_perm(low, low_bias, 0x5432);
     }
     words = reinterpret_cast<unsigned*>(shared + memory.output);
-    for (int k = threadIdx.x; k < units * 64 * BLOCKS; k += blockDim.x) {
-        const int half = k & 1, thread = k / 2 & 31, tile = k / 64 % BLOCKS, group = k / 64 / BLOCKS;
-        const int column = 2 + tile * 8 + thread / 4, unit = group * 16 + half * 8 + thread % 4 * 2;
+    for (int k = threadIdx.x; k < units * 64 * (BLOCKS + 1); k += blockDim.x) {
+        const int half = k & 1, thread = k / 2 & 31, tile = k / 64 % (BLOCKS + 1), group = k / 64 / (BLOCKS + 1);
+        const int column = tile * 8 + thread / 4, unit = group * 16 + half * 8 + thread % 4 * 2;
+        const float scale = 1.0f / unscale[column];
         unsigned* at = words + (k / 2) * 4 + half;
-        split_half(layer2(column, unit), layer2(column, unit + 1), at[0], at[2]);
-    }
-    words = reinterpret_cast<unsigned*>(shared + memory.move);
-    for (int k = threadIdx.x; k < units * 64; k += blockDim.x) {
-        // Columns: both high parts, both low parts, zeros.
-        const int half = k & 1, g = k / 8 & 7, unit = k / 64 * 16 + half * 8 + k / 2 % 4 * 2;
-        unsigned high, low;
-        split_half(layer2(g & 1, unit), layer2(g & 1, unit + 1), high, low);
-        words[k] = g < 2 ? high : g < 4 ? low : 0u;
+        split_half(weight_of_output(column, unit) * scale, weight_of_output(column, unit + 1) * scale, at[0], at[2]);
     }
 }
 
@@ -625,7 +619,7 @@ template <int BLOCKS> struct Perception {
 
 // The network's updates of 16 particles.
 template <int BLOCKS> struct Updates {
-    float states[BLOCKS][4], move[4];  // Changes of states; displacements δ, in lanes with t = 0.
+    float outputs[BLOCKS + 1][4];  // Changes of states by blocks of 8; then δ, in lanes with t = 0.
 
     __device__ void compute(const Perception<BLOCKS>& seen, const unsigned char* shared, int units)
     {
@@ -637,10 +631,8 @@ template <int BLOCKS> struct Updates {
         for (int r = 0; r < 2; ++r) {
             float size = fmaxf(1.0f, fmaxf(fabsf(seen.density[r][0]), fabsf(seen.density[r][1])));
             #pragma unroll
-            for (int block = 0; block < 4 * BLOCKS; ++block)
-                #pragma unroll
-                for (int e = 0; e < 2; ++e)
-                    size = fmaxf(size, fabsf(seen.fields[block / BLOCKS][block % BLOCKS][r][e]));
+            for (int k = 0; k < 8 * BLOCKS; ++k)
+                size = fmaxf(size, fabsf(seen.fields[k / 2 / BLOCKS][k / 2 % BLOCKS][r][k % 2]));
             size = fmaxf(size, __shfl_xor_sync(~0u, size, 1));
             size = fmaxf(size, __shfl_xor_sync(~0u, size, 2));
             const float scale = scale_to(size, 8);
@@ -662,74 +654,55 @@ template <int BLOCKS> struct Updates {
         const uint4* hidden = reinterpret_cast<const uint4*>(shared + memory.hidden) + lane;
         const unsigned* extras = reinterpret_cast<const unsigned*>(shared + memory.extra) + lane;
         const uint4* output = reinterpret_cast<const uint4*>(shared + memory.output) + lane;
-        const uint2* moves = reinterpret_cast<const uint2*>(shared + memory.move) + lane;
         #pragma unroll 1
         for (int unit = 0; unit < units; unit += 2) {
             #pragma unroll
-            for (int k = 0; k <= BLOCKS; ++k)
-                #pragma unroll
-                for (int e = 0; e < 4; ++e) product[k][e] = 0.0f;
+            for (int k = 0; k < 4 * BLOCKS + 4; ++k) product[k / 4][k % 4] = 0.0f;
             #pragma unroll
             for (int half = 0; half < 2; ++half) {
                 float sum[3][2][4] = {};
                 #pragma unroll
-                for (int side = 0; side < 2; ++side) {
-                    #pragma unroll
-                    for (int k = 0; k < 2 * BLOCKS; ++k) {
-                        const uint4 weight = hidden[(side * 2 * BLOCKS + k) * 32];
-                        multiply_half(sum[0][side], left[k], weight.x, weight.y);
-                        multiply_half(sum[1][side], rest[k], weight.x, weight.y);
-                        multiply_half(sum[2][side], left[k], weight.z, weight.w);
-                    }
-                    multiply_half8(sum[1][side], extra, extras[side * 32]);
+                for (int k = 0; k < 4 * BLOCKS; ++k) {
+                    const int side = k % 2;
+                    const uint4 weight = hidden[(side * 2 * BLOCKS + k / 2) * 32];
+                    multiply_half(sum[0][side], left[k / 2], weight.x, weight.y);
+                    multiply_half(sum[1][side], rest[k / 2], weight.x, weight.y);
+                    multiply_half(sum[2][side], left[k / 2], weight.z, weight.w);
                 }
+                multiply_half8(sum[1][0], extra, extras[0]);
+                multiply_half8(sum[1][1], extra, extras[32]);
                 unsigned high[4], low[4];
                 #pragma unroll
-                for (int side = 0; side < 2; ++side) {
+                for (int k = 0; k < 4; ++k) {
+                    float value[2];
                     #pragma unroll
-                    for (int r = 0; r < 2; ++r) {
-                        float value[2];
-                        #pragma unroll
-                        for (int e = 0; e < 2; ++e) {
-                            const int k = 2 * r + e;
-                            value[e] = sum[0][side][k] + (sum[1][side][k] + sum[2][side][k]);
-                            // A hidden unit that is NaN stays so, as it does in torch.
-                            if (value[e] <= 0.0f) value[e] = 0.0f;
-                        }
-                        split_half(value[0], value[1], high[2 * side + r], low[2 * side + r]);
+                    for (int e = 0; e < 2; ++e) {
+                        const int side = k / 2, entry = k % 2 * 2 + e;
+                        value[e] = sum[0][side][entry] + (sum[1][side][entry] + sum[2][side][entry]);
+                        // A hidden unit that is NaN stays so, as it does in torch.
+                        if (value[e] <= 0.0f) value[e] = 0.0f;
                     }
+                    split_half(value[0], value[1], high[k], low[k]);
                 }
-                const uint2 move_weight = moves[0];
-                multiply_half(product[BLOCKS], low, move_weight.x, move_weight.y);
                 #pragma unroll
-                for (int block = 0; block < BLOCKS; ++block) {
-                    const uint4 weight = output[block * 32];
-                    multiply_half(product[block], low, weight.x, weight.y);
-                    multiply_half(product[block], high, weight.z, weight.w);
-                    multiply_half(product[block], high, weight.x, weight.y);
+                for (int tile = 0; tile <= BLOCKS; ++tile) {
+                    const uint4 weight = output[tile * 32];
+                    multiply_half(product[tile], low, weight.x, weight.y);
+                    multiply_half(product[tile], high, weight.z, weight.w);
+                    multiply_half(product[tile], high, weight.x, weight.y);
                 }
-                multiply_half(product[BLOCKS], high, move_weight.x, move_weight.y);
                 hidden += 4 * BLOCKS * 32;
                 extras += 64;
-                output += BLOCKS * 32;
-                moves += 32;
+                output += (BLOCKS + 1) * 32;
             }
             #pragma unroll
-            for (int k = 0; k <= BLOCKS; ++k)
-                #pragma unroll
-                for (int e = 0; e < 4; ++e) total[k][e] += product[k][e];
+            for (int k = 0; k < 4 * BLOCKS + 4; ++k) total[k / 4][k % 4] += product[k / 4][k % 4];
         }
 
-        const float* unscales = reinterpret_cast<const float*>(shared + memory.unscale);
+        const float* unscales = reinterpret_cast<const float*>(shared + memory.unscale) + 2 * t;
         #pragma unroll
-        for (int k = 0; k < 4; ++k) {
-            #pragma unroll
-            for (int block = 0; block < BLOCKS; ++block)
-                states[block][k] = total[block][k] * unscales[2 + 8 * block + 2 * t + (k & 1)] * unscale[k / 2];
-            // Columns 2 and 3 are of the low parts of the weights.
-            const float small = __shfl_xor_sync(~0u, total[BLOCKS][k], 1);
-            move[k] = (total[BLOCKS][k] + small) * unscales[k & 1] * unscale[k / 2];
-        }
+        for (int k = 0; k < 4 * BLOCKS + 4; ++k)
+            outputs[k / 4][k % 4] = total[k / 4][k % 4] * unscales[8 * (k / 4) + (k & 1)] * unscale[k % 4 / 2];
     }
 };
 
@@ -831,7 +804,7 @@ __device__ inline void roll_worlds(
                 for (int r = 0; r < 2; ++r) {
                     if (tile * 16 + g + 8 * r >= total) continue;
                     if (t == 0) {
-                        const float ax = updates.move[2 * r], ay = updates.move[2 * r + 1];
+                        const float ax = updates.outputs[BLOCKS][2 * r], ay = updates.outputs[BLOCKS][2 * r + 1];
                         const float length = numbers.reach / (1.0f + __fsqrt_rn(fmaf(ax, ax, ay * ay)));
                         float2 place = next[index[r]];
                         place.x = fmaf(length, ax, place.x);
@@ -846,8 +819,8 @@ __device__ inline void roll_worlds(
                     for (int block = 0; block < BLOCKS; ++block) {
                         float2* at = group.channels(index[r], block, t);
                         float2 value = *at;
-                        value.x = fmaf(updates.states[block][2 * r], numbers.dt, value.x);
-                        value.y = fmaf(updates.states[block][2 * r + 1], numbers.dt, value.y);
+                        value.x = fmaf(updates.outputs[block][2 * r], numbers.dt, value.x);
+                        value.y = fmaf(updates.outputs[block][2 * r + 1], numbers.dt, value.y);
                         group.put(at, value);
                         grown = max(grown, max(__float_as_uint(value.x) & 0x7fffffffu,
                             __float_as_uint(value.y) & 0x7fffffffu));

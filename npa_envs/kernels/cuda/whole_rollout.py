@@ -45,7 +45,7 @@ class WorldVariant(NamedTuple):
     def memory(self, hidden_dim: int) -> int:
         """Return the shared memory of a block [bytes], as `whole_rollout.cuh` divides it."""
         units, blocks, size = -(-hidden_dim // 32) * 2, self.channel_blocks, self.size
-        weights = units * (2560 * blocks + 512) + 128
+        weights = units * (2560 * blocks + 768) + 128
         rows = (size + 8) * (32 * blocks + 16 + 16)
         return weights + self.groups * (rows + size * (32 * blocks + 4) + 144)
 
