@@ -67,8 +67,6 @@ def run_whole_rollout(
     hidden_dim, state_dim = len(hidden_bias), physics.state_dim
     variant = world_variant(world_count, particle_count, state_dim, hidden_dim, multiprocessors)
     terms, scale = physics.terms, physics.scale()
-    gradient_column = 2 * state_dim
-    density_column = gradient_column + 2 * state_dim * terms.state_gradient
     numbers = (
         1.0 / physics.eps,
         physics.max_displacement * physics.dt,
@@ -82,8 +80,8 @@ def run_whole_rollout(
         SORT_INTERVAL,
         INVERSES.index(terms.correction),
         int(physics.boundary == "reflecting"),
-        gradient_column if terms.state_gradient else -1,
-        density_column if terms.density_gradient else -1,
+        2 * state_dim if terms.state_gradient else -1,
+        2 * state_dim * (1 + terms.state_gradient) if terms.density_gradient else -1,
     )
     tensors = hidden_weight, hidden_bias, output_weight, masks, noise, x, s
     results = torch.empty_like(x), torch.empty_like(s)

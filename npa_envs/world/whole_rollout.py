@@ -69,8 +69,7 @@ def run_whole(
     with torch.no_grad():
         for first in range(0, spec.steps, together):
             steps = min(together, spec.steps - first)
-            source: Randomness | None = generator
-            begin = 0
+            source, begin = generator, 0
             if isinstance(generator, WorldRandom):
                 source = generator.take_steps(steps)
             elif not capturing:
@@ -79,21 +78,13 @@ def run_whole(
             x, s = run_whole_rollout(x, s, spec.physics, weights, steps, *draws)
             if first == 0 and not capturing:
                 # Only now, when the device has work.
-                _check_positions(particles.x, ready, generator, begin)
-            if isinstance(generator, WorldRandom):
-                assert isinstance(source, WorldRandom)
+                try:
+                    FiniteCheck(particles.x, ready).wait()
+                except NPAError:
+                    if not isinstance(generator, WorldRandom):
+                        offset = torch_generator(generator, x.device)
+                        give_back_draws(offset, begin, offset.get_offset() - begin)
+                    raise
+            if isinstance(generator, WorldRandom) and isinstance(source, WorldRandom):
                 generator.sync_with(source, steps)
     return particles.with_fields(x=x, s=s)
-
-
-def _check_positions(
-    x: Tensor, ready: torch.cuda.Event, generator: Randomness | None, begin: int
-) -> None:
-    """Raise NPAError, with the generator at its offset `begin`, unless positions are finite."""
-    try:
-        FiniteCheck(x, ready).wait()
-    except NPAError:
-        if not isinstance(generator, WorldRandom):
-            source = torch_generator(generator, x.device)
-            give_back_draws(source, begin, source.get_offset() - begin)
-        raise

@@ -153,11 +153,10 @@ __device__ inline void arrange_network(
     const int hidden_dim = hidden.shape[0], width = hidden.shape[1], warps = blockDim.x / 32;
     const int lane = threadIdx.x & 31, warp = threadIdx.x >> 5;
     for (int unit = warp; unit < 16 * units; unit += warps) {
-        float size = unit < hidden_dim ? fabsf(bias.data[unit]) : 0.0f;
-        float rest = 0.0f;
+        float size = unit < hidden_dim && lane == 0 ? fabsf(bias.data[unit]) : 0.0f;
         for (int c = lane; unit < hidden_dim && c < width; c += 32)
-            rest += fabsf(hidden.data[(size_t)unit * width + c]);
-        size += lane_sum<float, 32, true, 1>(rest);
+            size += fabsf(hidden.data[(size_t)unit * width + c]);
+        size = lane_sum<float, 32, true, 1>(size);
         if (lane == 0) scales[unit] = scale_to(size, 4);
     }
     __syncthreads();
@@ -353,6 +352,8 @@ __device__ inline void sort_world(const Group& group, int step, int count, float
 // Constants of a rollout, in the order in which `run_whole_rollout` gives them.
 struct RolloutNumbers {
     float inverse_eps, reach, dt, gradient_scale, density_scale, side_x, side_y;
+
+    __device__ float2 within_walls(float2 p) const { return make_float2(mirrored(p.x, side_x), mirrored(p.y, side_y)); }
 };
 struct RolloutChoices {
     int steps, sort_interval;
@@ -415,7 +416,7 @@ struct DensityPhase {
                     const int rank = first[pass] + __popc(ballots[pass] & ((1u << lane) - 1u));
                     group.put(&group.active()[rank], (unsigned short)i);
                 } else if (choices.reflecting && i < count) {
-                    next = make_float2(mirrored(next.x, numbers.side_x), mirrored(next.y, numbers.side_y));
+                    next = numbers.within_walls(next);
                 }
                 group.put(&group.places(step + 1)[i], next);
             }
@@ -809,10 +810,7 @@ __device__ inline void roll_worlds(
                         float2 place = next[index[r]];
                         place.x = fmaf(length, ax, place.x);
                         place.y = fmaf(length, ay, place.y);
-                        if (choices.reflecting) {
-                            place.x = mirrored(place.x, numbers.side_x);
-                            place.y = mirrored(place.y, numbers.side_y);
-                        }
+                        if (choices.reflecting) place = numbers.within_walls(place);
                         group.put(&next[index[r]], place);
                     }
                     #pragma unroll

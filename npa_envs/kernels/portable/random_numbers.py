@@ -132,9 +132,7 @@ def draw_masks(
         element = (4 * call + k) * threads + thread % threads
         if element < masks.shape[1]:
             uniform = wp.float32(drawn[k]) * STEP_32 + HALF_STEP_32
-            masks[row, element] = wp.uint8(0)
-            if uniform < probability:
-                masks[row, element] = wp.uint8(1)
+            masks[row, element] = wp.where(uniform < probability, wp.uint8(1), wp.uint8(0))
 
 
 @cached_under_lock()
