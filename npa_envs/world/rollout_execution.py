@@ -1,11 +1,11 @@
-"""How a rollout runs: one of several ways, which all have the same results.
+"""How a rollout runs: one of several ways with the same results; one kernel rounds otherwise.
 
 A rollout takes the first way whose condition is met; `run_all_steps` is the last three of them:
 
 | way                      | condition                                      | code                 |
 |--------------------------|------------------------------------------------|----------------------|
+| run all in one kernel    | "whole" on CUDA, no gradients, small worlds    | whole_rollout.py     |
 | skip steps once at rest  | rule with dead zone, no gradients, many steps  | `execute`            |
-| run all in one kernel    | small worlds, no gradients, `ops/backend.py`   | whole_rollout.py     |
 | replay CUDA graphs       | CUDA, third call on                            | capture_cache.py     |
 | replay recorded launches | CPU, no gradients, small worlds, third call on | replayed_launches.py |
 | launch each step         | none                                           | `RolloutSpec.launch` |
