@@ -128,7 +128,10 @@ class TextureMetric:
         ):
             likeness = (rows @ matched).T
             side = math.isqrt(len(rows))
-            fields += [likeness.unflatten(1, (side, side)), 0.5 * variance.log()[None]]
+            likeness = likeness.unflatten(1, (side, side))
+            if wrap:  # The last row and column are the first again.
+                likeness = likeness[:, :-1, :-1]
+            fields += [likeness, 0.5 * variance.log()[None]]
             fields.append((self._turned.T @ colours.flatten(1)).view(-1, *colours.shape[1:]))
         return fields
 
