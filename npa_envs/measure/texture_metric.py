@@ -6,6 +6,7 @@ colours, each at three lengths. Each is divided by that of a quarter of the targ
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -140,10 +141,8 @@ class TextureMetric:
         distances = []
         for number, (field, expected) in enumerate(zip(fields, self._expected, strict=True)):
             apart = (_distribution(field) - expected).double()
-            distance = apart.square().mean()
-            if number % 3 == 0:
-                distance = distance + MEAN_WEIGHT * apart.mean(0).square().mean()
-            distances.append(distance)
+            weight = MEAN_WEIGHT if number % 3 == 0 else 0.0
+            distances.append(apart.square().mean() + weight * apart.mean(0).square().mean())
         return torch.stack(distances).view(-1, 3)
 
 
@@ -196,11 +195,5 @@ def _distribution(field: Tensor) -> Tensor:
 
 def _quarters(fields: list[Tensor]) -> Iterator[list[Tensor]]:
     """Yield the fields [F, S, S] of each quarter of a picture."""
-    for down in (False, True):
-        for across in (False, True):
-            yield [_half(_half(field, down, 1), across, 2) for field in fields]
-
-
-def _half(field: Tensor, last: bool, dim: int) -> Tensor:
-    half = field.shape[dim] // 2
-    return field.narrow(dim, field.shape[dim] - half if last else 0, half)
+    for down, across in itertools.product((0, 1), repeat=2):
+        yield [field.chunk(2, 1)[down].chunk(2, 2)[across] for field in fields]
