@@ -127,9 +127,8 @@ class TextureMetric:
         for (rows, variance, colours), matched in zip(
             _levels(picture, wrap), self._matched, strict=True
         ):
-            likeness = (rows @ matched).T
             side = math.isqrt(len(rows))
-            likeness = likeness.unflatten(1, (side, side))
+            likeness = (rows @ matched).T.reshape(-1, side, side)
             if wrap:  # The last row and column are the first again.
                 likeness = likeness[:, :-1, :-1]
             fields += [likeness, 0.5 * variance.log()[None]]
