@@ -65,7 +65,9 @@ class GardenerTask(GardenTask[Gardener2DEnvConfig]):
         happens = (chance[:, :1] < config.gust_chance).to(x.dtype)
         move = config.gust_length * happens * torch.cat((angle.cos(), angle.sin()), dim=1)
         # A negative radius wipes nothing.
-        radius = torch.where(chance[:, 1] < config.blight_chance, config.blight_radius, -1.0)
+        radius = torch.where(chance[:, 1] < config.blight_chance, config.blight_radius, -1.0).to(
+            x.dtype
+        )
         box = self.periodic_sides
         if not (torch.is_grad_enabled() and (x.requires_grad or s.requires_grad)):
             # The lines below by one launch.

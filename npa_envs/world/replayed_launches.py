@@ -196,7 +196,7 @@ class _ReplayedRollout(torch.autograd.Function):
 def _can_train(step: RuleStep, particles: Particles, steps: int) -> bool:
     """Return whether the backward pass of a rollout can be replayed: that of a plain rule."""
     return (
-        isinstance(step.network, FoldedRule)
+        type(step.network) is FoldedRule
         and step.network.arranged is None
         and step.detach_positions
         and step.physics.boundary != "reflecting"
