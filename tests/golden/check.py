@@ -19,7 +19,7 @@ HERE = Path(__file__).resolve().parent
 ROOT = HERE.parents[1]
 
 ACCEPTED: dict[str, str] = {
-    r".*points.*/picture": "class 9 is drawn in lavender",
+    r".*(points|PointClassification|digits).*/picture": "class 9 is drawn in lavender",
     r"names/.*": "uniform_ball is public, NumericInfos is gone",
 }
 """Patterns, which names of arrays begin with that may differ or be on one side alone, and why."""
