@@ -273,12 +273,12 @@ class ParticleTask(Generic[ConfigT]):
         """
         return s
 
-    def wounds_between(self, before: Particles, after: Particles) -> Tensor:
-        """Return which pixels of each world's picture a damage has changed, uint8, [B, R, R]."""
-        raise NPAError(
-            f"wound_weight needs worlds that grow one upright picture each, got those of a "
-            f"{type(self).__name__}: leave it out"
-        )
+    def wounds_between(self, before: Particles, after: Particles) -> Tensor | None:
+        """Return which pixels of each world's picture a damage has changed, uint8, [B, R, R].
+
+        None for tasks whose worlds do not grow an upright picture each.
+        """
+        return None
 
     def with_wounds(self, wounds: Tensor, weight: float) -> Self:
         """Return a copy of the task whose loss also has, by `weight`, the mean over these pixels.

@@ -350,14 +350,14 @@ class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
         return config.splat_weight * total, {"density": density, "colour": colour, "wound": wound}
 
     @torch.no_grad()
-    def wounds_between(self, before: Particles, after: Particles) -> Tensor:
+    def wounds_between(self, before: Particles, after: Particles) -> Tensor | None:
         """Return which pixels of each world's picture a damage has changed, uint8, [B, R, R].
 
         Pixels around them are included, by a square of ε / 2. Pictures are centred as worlds were
         before. A world whose picture changed nearly everywhere has no such pixels.
         """
         if self._tries_angles:
-            return super().wounds_between(before, after)
+            return None
         shift = (self._target_mean.to(before.x) - world_mean(before.x))[:, None]
         old, new = (self.picture(w.x + shift, w.s, centred=False) for w in (before, after))
         changed = ((new - old).abs().sum(dim=-1) > WOUND_CHANGE).to(old.dtype)
@@ -524,12 +524,13 @@ MORPHOGENESIS2D_PRESETS = presets_of(
     # Found by experiment on pictures that nobody tuned for: docs/recipes.md.
     best=TrainConfig(
         task=Morphogenesis2DConfig(
-            escape_share=2e-4, damage_radius=0.2, cut_share=0.5, **_STABILITY,
+            escape_share=2e-4, damage_radius=0.2, cut_share=0.8, cut_anywhere=True, **_STABILITY,
         ),
-        repeats=1, iterations=8000, pool_size=64, steps=(48, 80), optimiser="muon",
+        repeats=1, iterations=12_000, pool_size=64, steps=(48, 80), optimiser="muon",
         learning_rate=3e-3, weight_decay=0.1, schedule="cosine", max_age_range=(16, 16_384),
         damage_and_keep_share=0.7, damage_share=0.125, stillness_min_age=1024, stillness_weight=2.0,
-        stillness_power=4.0, dead_zone=1e-3, initial_rule="heart-first",
+        stillness_power=4.0, dead_zone=1e-3, initial_rule="heart-first", wound_chance=0.2,
+        wound_weight=0.5,
     ),
     # A few particles that see far; of two worlds one is young, one grown and at rest:
     # docs/recipes.md.

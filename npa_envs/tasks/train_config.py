@@ -155,7 +155,8 @@ class TrainConfig(Generic[TaskConfigT]):
 
     wound_chance: Unlisted[float] = 0.0
     """Probability that a world of at least `wound_min_age` is damaged when a batch has it, and
-    keeps its age (dimensionless). Needs `max_age_range`."""
+    keeps its age (dimensionless); every second world of the pool is left out. Needs
+    `max_age_range`."""
 
     wound_min_age: Unlisted[int] = 256
     """Age [steps] from which `wound_chance` damages a world."""
@@ -163,7 +164,7 @@ class TrainConfig(Generic[TaskConfigT]):
     wound_weight: Unlisted[float] = 0.0
     """Weight of each world's mean loss over the pixels that its last damage changed, relative to
     the whole picture's loss (dimensionless). The pool stores these pixels until the world is
-    replaced. For pictures; needs `max_age_range`."""
+    replaced. For upright pictures, without effect elsewhere; needs `max_age_range`."""
 
     damage_share: float = 1.0
     """Fraction in [0, 1] of the pool whose worlds are damaged in every batch, so that a rule learns

@@ -267,8 +267,8 @@ class TrainingCycle:
             worlds = start_worlds.where(expired, worlds)
         self.batch.start.copy_(worlds)
         if self.batch.wounds is not None and self.pool.wounds is not None:
-            assert expired is not None, "a weight of wounds needs max_age_range"
             wounds = self.task.wounds_between(before, worlds)
+            assert wounds is not None and expired is not None, "a picture, and max_age_range"
             old = self.pool.wounds.index_select(0, self._index)
             hurt = wounds.amax((1, 2), keepdim=True) > 0
             wounds = torch.where(hurt, wounds, old)
@@ -277,14 +277,17 @@ class TrainingCycle:
     def _damaged_and_expired(self, worlds: Particles) -> tuple[Tensor, Tensor | None]:
         """Return which worlds of the batch to damage, and which to replace; set all ages."""
         config = self._config
-        damaged = self._pool_indices[self._index] < config.damage_share * config.pool_size
+        number = self._pool_indices[self._index]
+        damaged = number < config.damage_share * config.pool_size
         if not config.ages:
             return damaged, None
         age, expired = self.pool.ages_of(self._index)
         self._age.copy_(age.masked_fill(expired, 0))
         if config.wound_chance > 0.0:
             chance = uniform_draws(self.random.worlds, (len(expired), 1), worlds.x)[:, 0]
-            damaged |= (chance < config.wound_chance) & (self._age >= config.wound_min_age)
+            # The other half of the pool grows old unharmed, or rules would forget to last.
+            hit = (chance < config.wound_chance) & (number % 2 == 1)
+            damaged |= hit & (self._age >= config.wound_min_age)
         self.batch.past_min_age.copy_((self._age >= config.stillness_min_age) & ~damaged)
         if config.damage_and_keep_share > 0.0:
             chance = uniform_draws(self.random.worlds, (len(expired), 1), worlds.x)[:, 0]

@@ -68,6 +68,7 @@ class EagerIteration:
         """Pixels that each world's last damage changed, uint8, [B, R, R]; None: without weight."""
         if config.wound_weight > 0.0:
             self.wounds = task.wounds_between(worlds, worlds)
+        if self.wounds is not None:
             task = task.with_wounds(self.wounds, config.wound_weight)
         self._config = config
         self._divides = bool(fate_parameters(rule))
