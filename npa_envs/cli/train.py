@@ -164,7 +164,7 @@ def _parse_fields(
     """Return the options of the run, and `defaults` with the values of options for its fields."""
     description = f"Train on {task_name}. Defaults shown are those of the preset."
     if {"-h", "--help"} & set(arguments):
-        description += f" All options: npa-envs train {task_name} --help-all"
+        description += f" More options: npa-envs train {task_name} --help-all"
         defaults = _with_fields(defaults, lambda marks: COMMON in marks)
     elif "--help-all" in arguments:
         defaults = _with_fields(defaults, lambda marks: UNLISTED not in marks)
