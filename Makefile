@@ -34,6 +34,7 @@ $(BIN)/python:
 	$(PYTHON) -m venv $(VENV)
 
 $(CORE): $(INPUTS) | $(BIN)/python
+	@echo "installing torch and more: two minutes, with CUDA up to twenty"
 	$(BIN)/python -m pip install --quiet $(PIP_ARGS) -e . -c constraints.txt
 	touch $@
 
@@ -50,6 +51,7 @@ $(DOCS): $(INPUTS) $(wildcard $(CORE)) | $(BIN)/python
 demo: $(CORE)
 	$(BIN)/npa-envs warmup --device cpu
 	$(BIN)/npa-envs demo --device cpu --out demo
+	@echo "next: open demo/gecko.mp4; then: source .venv/bin/activate, pip install -e '.[view]', npa-envs view gecko"
 
 test: $(DEV)
 	$(PYTEST) -m 'not slow'

@@ -18,6 +18,7 @@ from typing import Any
 from unittest.mock import patch
 
 from docutils import nodes
+from latex2mathml.converter import convert
 from sphinx.application import Sphinx
 from sphinx.util.docutils import SphinxDirective
 
@@ -70,6 +71,8 @@ _GROUPS = ("Perception", "Outputs", "Equivariance", "Codes")
 napoleon_custom_sections = [(name, "params_style") for name in _GROUPS]
 
 html_theme = "furo"
+# Browsers draw MathML themselves: the site needs no script for formulas, and no network.
+html_math_renderer = "mathml"
 html_title = "npa-envs"
 html_static_path = ["static"]
 html_css_files = ["site.css"]
@@ -162,14 +165,29 @@ class CommandHelp(SphinxDirective):
             main([*self.arguments, "--help"])
         # Descriptions come as one line each, whatever the terminal's width.
         lines = printed.getvalue().strip().splitlines()
-        text = "\n".join(fill(line, 88) if len(line) > 88 else line for line in lines)
+        text = "\n".join(wrapped(line) if len(line) > 88 else line for line in lines)
         if not text:
             raise self.error(f"npa-envs {' '.join(self.arguments)} --help prints nothing")
         return [nodes.literal_block(text, text, language="text")]
 
 
+def wrapped(line: str) -> str:
+    """Return a line of a help cut at 88 letters, the rest below the text of its second column."""
+    columns = re.match(r" +\S+ {2,}", line)
+    return fill(line, 88, subsequent_indent=" " * (columns.end() if columns else 0))
+
+
+def write_formula(translator: Any, node: nodes.Element) -> None:
+    """Write a formula, in the text or on a line of its own, as MathML."""
+    inline = isinstance(node, nodes.math)
+    formula = convert(node.astext(), display="inline" if inline else "block")
+    translator.body.append(formula if inline else f'<div class="math">{formula}</div>')
+    raise nodes.SkipNode
+
+
 def setup(app: Sphinx) -> None:
     """Tell Sphinx of what is made here."""
+    app.add_html_math_renderer("mathml", (write_formula, None), (write_formula, None))
     app.add_directive("command-help", CommandHelp)
     app.connect("source-read", add_menus)
     # Napoleon's own priority is 500.

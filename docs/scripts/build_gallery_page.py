@@ -1,4 +1,4 @@
-"""Write the gallery of shipped rules, `docs/gallery.md`, from their cards and scores.
+"""Write the gallery of shipped rules, `docs/gallery.md`, from their names.
 
 python docs/scripts/build_gallery_page.py          write the page
 python docs/scripts/build_gallery_page.py --check  fail where it is not current
@@ -11,11 +11,9 @@ from pathlib import Path
 
 from page_parts import NOTE, write_or_check
 
-from npa_envs.measure.quality import score_line, scores
 from npa_envs.rule.files import shipped_rules
 
 DOCS = Path(__file__).resolve().parents[1]
-CARDS = DOCS.parent / "npa_envs" / "rule" / "shipped"
 OPENING = """\
 # Gallery
 
@@ -24,8 +22,7 @@ disk, ball or random cloud, and know nothing of their places. A rule's name stan
 commands and in `npa_envs.load_rule`. `npa-envs view NAME` opens a rule in the browser, and
 `npa-envs export-web --gallery --out gallery.html` writes one page that runs all 2D rules.
 
-Figures are means over seeds that training never saw; a lower loss is better. A card says how the
-rule was trained, and all that was measured."""
+A card says how the rule was trained, and all that was measured."""
 HEADINGS = {
     "morphogenesis2d": "Pictures",
     "morphogenesis3d": "Things in 3D",
@@ -50,14 +47,12 @@ COMMANDS = {
 def entry(task: str, name: str) -> str:
     """Return what the page says of a rule, Markdown."""
     caption = SHOWN[task].format(name=name.capitalize())
-    sentence = (CARDS / f"{name}.md").read_text(encoding="utf-8").split("\n\n")[1]
-    score = score_line(scores(name))
+    card = f"../npa_envs/rule/shipped/{name}.md"
     return "\n\n".join(
         (
             f"### {name}",
-            f"![{caption}](images/gallery/{name}.webp)",
-            f"{sentence} Measured: {score}.",
-            f"- [The card of {name}](../npa_envs/rule/shipped/{name}.md)",
+            f"[![{caption}](images/gallery/{name}.webp)]({card})",
+            f"- [card]({card})",
         )
     )
 
@@ -65,7 +60,7 @@ def entry(task: str, name: str) -> str:
 def page() -> str:
     """Return the page, Markdown."""
     parts = [
-        NOTE.format(script="build_gallery_page.py", source="cards and scores"),
+        NOTE.format(script="build_gallery_page.py", source="shipped rules and its own texts"),
         OPENING,
     ]
     for task, heading in HEADINGS.items():

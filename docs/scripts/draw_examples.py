@@ -45,10 +45,10 @@ def join(paths: list[Path]) -> None:
         curve = json.loads(path.read_text(encoding="utf-8"))
         runs[path.stem] = {"name": path.stem, "command": command, **curve}
     facts = {
-        "command": "python examples/NAME, on one thread beside other work",
+        "command": "python examples/NAME",
         "commit": current_commit(),
         "date": date.today().isoformat(),
-        "machine": machine(torch.device("cpu")),
+        "machine": f"{machine(torch.device('cpu'))}, one thread beside other work",
         "threads": 1,
         "torch": torch.__version__,
     }

@@ -111,7 +111,10 @@ def main(names: list[str]) -> None:
     for task, film in FILMS.items():
         for name in shipped_rules(task):
             if name in names or not names:
-                write_webp(FOLDER / f"{name}.webp", film(name), FPS, quality=QUALITY.get(task, 50))
+                # What has grown comes first: it is what is seen of a film that does not play.
+                frames = [*film(name)]
+                frames = [frames[-1]] * STILL + frames
+                write_webp(FOLDER / f"{name}.webp", frames, FPS, quality=QUALITY.get(task, 50))
 
 
 if __name__ == "__main__":

@@ -157,7 +157,7 @@ def test_the_list_of_pages_leads_to_every_page_and_notebook():
 
 
 def test_the_home_page_has_four_doors_with_pictures():
-    doors = section("index", "Four doors").split("\n### ")[1:]
+    doors = section("index", "What do you want to do?").split("\n### ")[1:]
     assert len(doors) == 4
     for door in doors:
         (page,) = re.findall(r"^\[[^\]]+\]\(([^)]+)\)\n", door)

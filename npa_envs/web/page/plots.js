@@ -51,6 +51,6 @@ export function make(tag, properties = {}) {
 export function short(number) {
   const size = Math.abs(number);
   if (Number.isInteger(number) && size < 1e6) return String(number);
-  if (size >= 1000 || (size > 0 && size < 0.001)) return number.toExponential(1);
+  if (size >= 1e5 || (size > 0 && size < 0.001)) return number.toExponential(1);
   return String(+number.toPrecision(3));
 }
