@@ -181,6 +181,9 @@ def write_formula(translator: Any, node: nodes.Element) -> None:
     """Write a formula, in the text or on a line of its own, as MathML."""
     inline = isinstance(node, nodes.math)
     formula = convert(node.astext(), display="inline" if inline else "block")
+    # Bars without the room of an operator, and a hat that does not grow.
+    formula = formula.replace('<mo stretchy="false">&#x0007C;</mo>', "<mi>|</mi>")
+    formula = formula.replace("<mo>&#x0005E;</mo>", '<mo stretchy="false">&#x002C6;</mo>')
     translator.body.append(formula if inline else f'<div class="math">{formula}</div>')
     raise nodes.SkipNode
 

@@ -27,6 +27,7 @@ import npa_envs
 from npa_envs.agents.learning import Budget, train
 from npa_envs.cli import COMMANDS, main
 from npa_envs.envs import multispecies_v0, particles_v0
+from npa_envs.measure.speed.suites import SUITES
 from npa_envs.ops.backend import KernelRequest, describe
 from npa_envs.registration import ENVIRONMENTS, GARDEN_IDS
 from npa_envs.training import TASKS as TRAINED
@@ -110,8 +111,10 @@ def test_the_reference_of_commands_has_every_command_and_task():
 def test_commands_in_blocks_of_shell_have_the_options_that_they_are_given(capsys):
     texts = "\n".join(path.read_text(encoding="utf-8") for path in TEXTS)
     blocks = re.findall(r"^ *```(?:sh|bash)\n(.*?)^ *```", texts, re.M | re.S)
+    blocks += re.findall(r"^Measured: .*`(npa-envs [^`]+)`", texts, re.M)
+    assert set(re.findall(r"npa-envs bench .*?--suite (\w+)", texts)) <= set(SUITES)
     used: dict[tuple[str, ...], set[str]] = {}
-    for line in re.sub(r"\\\n", " ", "".join(blocks)).splitlines():
+    for line in re.sub(r"\\\n", " ", "\n".join(blocks)).replace(" && ", "\n").splitlines():
         # What follows `--` is for the runs of a sweep.
         words = re.sub(r"#.*| > .*| -- .*", "", line).replace(".venv/bin/", "").split()
         if words[:1] == ["npa-envs"] and words[1:2] and words[1][0] != "-" and "TASK" not in words:
@@ -343,7 +346,7 @@ PROGRAMS = {
             "truncated and info['loss'] < 0.3",
             "envs.num_envs == 8",
         ),
-        (("4096", "256"), ("steps=512", "steps=8")),
+        (("4096", "256"), ("steps=64", "steps=8")),
     ),
 }
 
