@@ -28,6 +28,14 @@ if TYPE_CHECKING:
 
 OptionsT = TypeVar("OptionsT")
 
+# tyro keeps the line breaks of a field's docstring, because its lines are indented.
+with contextlib.suppress(KeyError, AttributeError):
+    _docstrings = vars(tyro)["_docstrings"]
+    _parse = _docstrings.parse_docstring_from_object
+    _docstrings.parse_docstring_from_object = lambda cls: {
+        name: " ".join(text.split()) for name, text in _parse(cls).items()
+    }
+
 
 def parse_options(
     cls: type[OptionsT],
@@ -194,10 +202,7 @@ def duration(seconds: float) -> str:
 
 
 def writable_folder(path: Path, name: str = "out") -> Path:
-    """Create a folder if it is missing, and check that files can be written to it.
-
-    `name` is the command's option, for errors.
-    """
+    """Return a folder, made where it is missing; raise NPAError for `name` if it takes no files."""
     must = "created"
     try:
         with made_folder(path):
@@ -286,10 +291,7 @@ def named_values(name: str, arguments: Iterable[str]) -> dict[str, Any]:
 
 
 def problem_of(options: Any, num_envs: int, steps: int | None = None) -> Problem:
-    """Return the problem to learn the environment of `options`, in `num_envs` worlds at a time.
-
-    `steps` is the length of episodes; None: as registered.
-    """
+    """Return the problem to learn `options.env`, with episodes of `steps`; None: as registered."""
     from npa_envs.agents.learning.problem import Problem, registration_of
 
     steps = registration_of(options.env).steps if steps is None else steps
@@ -298,10 +300,7 @@ def problem_of(options: Any, num_envs: int, steps: int | None = None) -> Problem
 
 
 def first_options(arguments: Sequence[str]) -> argparse.Namespace:
-    """Return the options that choose the defaults of others, such as `preset`, and all `words`.
-
-    tyro parses all options, but needs the defaults before.
-    """
+    """Return the options that tyro's defaults depend on, such as `preset`, and all `words`."""
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
     for name in ("preset", "device", "gpus"):
         parser.add_argument(f"--{name}")

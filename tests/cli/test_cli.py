@@ -97,6 +97,8 @@ def test_help_of_train_shows_the_most_used_options_and_help_all_all_of_them(caps
     assert "--help-all" not in text.partition("Examples")[0]
     assert counts == [25, 76]
     assert "--wound-weight" not in text
+    # A docstring breaks its line before the backtick.
+    assert "but 2 for small batches of `train` on" in text
     first = common.first_options(["--wound-weight", "0.5", "--max-age-range", "16", "64"])
     assert parse_run("morphogenesis2d", first)[1].wound_weight == 0.5
     text = help_of(capsys, "train", "texture", "--help")
