@@ -208,7 +208,8 @@ def rollout(
         dt: Time step, dimensionless.
         position_noise: Standard deviation of the noise added to every position in each step
             [length units].
-        detach_positions: Perception does not back-propagate into positions (the paper's choice).
+        detach_positions: Perception does not back-propagate into positions (the paper's choice): a
+            gradient by x is then a partial one. The moment correction has none in any case.
         memory: "store" stores all tensors of the backward pass. "recompute" recomputes two steps in
             three: about half the memory, and the time of two thirds of a forward pass more.
             "minimal" recomputes all but the last step: least memory, and the time of a forward pass
