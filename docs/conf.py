@@ -20,6 +20,7 @@ from unittest.mock import patch
 from docutils import nodes
 from latex2mathml.converter import convert
 from sphinx.application import Sphinx
+from sphinx.errors import ExtensionError
 from sphinx.util.docutils import SphinxDirective
 
 import npa_envs
@@ -181,6 +182,8 @@ def write_formula(translator: Any, node: nodes.Element) -> None:
     """Write a formula, in the text or on a line of its own, as MathML."""
     inline = isinstance(node, nodes.math)
     formula = convert(node.astext(), display="inline" if inline else "block")
+    if "\\" in formula:
+        raise ExtensionError(f"latex2mathml does not know all of {node.astext()!r}")
     # Bars without the room of an operator, and a hat that does not grow.
     formula = formula.replace('<mo stretchy="false">&#x0007C;</mo>', "<mi>|</mi>")
     formula = formula.replace("<mo>&#x0005E;</mo>", '<mo stretchy="false">&#x002C6;</mo>')
