@@ -26,7 +26,7 @@ def mixed_keys(keys: Tensor, number: int) -> Tensor:
     return _mix_keys(keys, ((number + 1) * GOLDEN + 2**63) % 2**64 - 2**63)
 
 
-@custom_op("npa::draw")
+@custom_op("npa::draw", of_all=True)
 def draw(
     keys: Tensor,
     episodes: Tensor,

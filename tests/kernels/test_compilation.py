@@ -32,6 +32,7 @@ from npa_envs.kernels.pictures.pixel_errors import gather_errors
 from npa_envs.kernels.portable.brush_sums import brush_kernel
 from npa_envs.kernels.portable.random_numbers import mix_keys
 from npa_envs.kernels.portable.rewards_and_ends import update_episodes
+from npa_envs.kernels.portable.update import report_finite
 from npa_envs.ops import warmup
 from npa_envs.ops.launch import launch, loaded_modules
 from npa_envs.runtime import start_warp
@@ -61,6 +62,7 @@ VARIANTS = {
     "vectors 3D": lambda: row_kernels(3, 32, 17, 8, False).read_rows,
     "sums of vectors": mixing_sum,
     "sums under brushes": lambda: brush_kernel(wp.float32, 3, True),
+    "reports": lambda: report_finite(wp.float32),
     "keys": lambda: mix_keys,
     "steering": lambda: steering_kernels(2, 8, True).steer,
     "steering 3D": lambda: steering_kernels(3, 8, False).steer,
