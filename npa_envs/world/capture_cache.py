@@ -37,10 +37,11 @@ from npa_envs.world.rule_settings import is_observed, settings_and_weights
 if TYPE_CHECKING:
     from npa_envs.world.rollout_execution import RolloutSpec
 
-CudaGraph = bool | Literal["auto"]
-"""Which rollouts are captured on CUDA: those without hooks ("auto"), all or none."""
+CudaGraph = bool | Literal["auto", "whole"]
+"""Which rollouts are captured on CUDA: those without hooks ("auto"), all or none. "whole" is
+"auto", but one kernel runs all steps of small worlds."""
 
-CUDA_GRAPH_CHOICES: tuple[CudaGraph, ...] = ("auto", True, False)
+CUDA_GRAPH_CHOICES: tuple[CudaGraph, ...] = ("auto", "whole", True, False)
 
 LAUNCHED_FIRST = 2
 """Number of calls of a group that are launched before the next one is captured."""

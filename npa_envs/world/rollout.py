@@ -226,7 +226,9 @@ def rollout(
             third call with the same shapes and options on. A network of one's own must then be a
             function of perception, parameters and buffers, as its Python code no longer runs; it is
             launched if its first replay gives other numbers. True captures from the second call on,
-            also rules with hooks; False captures nothing: see docs/performance.md.
+            also rules with hooks; False captures nothing: see docs/performance.md. "whole" is
+            "auto", but one kernel runs all steps of many small worlds, with other roundings: see
+            `npa_envs/ops/backend.py`.
         return_path_length: Also return the length of each particle's path.
 
     Returns:
