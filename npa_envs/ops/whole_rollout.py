@@ -26,6 +26,7 @@ VARIANTS: dict[int, tuple[tuple[int, int, int, float], ...]] = {
     64: ((2, 1, 8, 8.0), (1, 1, 16, math.inf)),
     128: ((4, 2, 1, 0.5), (4, 1, 4, 4.0), (2, 1, 8, math.inf)),
     256: ((8, 2, 1, 0.5), (8, 1, 2, 2.0), (4, 1, 4, math.inf)),
+    512: ((8, 2, 1, 0.5), (16, 1, 1, 1.0), (8, 1, 2, math.inf)),
 }
 """By the size of worlds: warps and blocks of a world, worlds of a block; and up to how many worlds
 per multiprocessor. Few worlds get more warps each; a world has the same bits in all variants."""

@@ -155,6 +155,7 @@ inline unsigned __ballot_sync(unsigned, bool condition)
 }
 inline int __popc(unsigned bits) { return std::popcount(bits); }
 inline int __clz(unsigned bits) { return std::countl_zero(bits); }
+inline int __ffsll(unsigned long long bits) { return bits ? std::popcount(bits ^ (bits - 1)) : 0; }
 inline int __ffs(unsigned bits) { return bits ? std::popcount(bits ^ (bits - 1)) : 0; }
 inline unsigned __funnelshift_l(unsigned low, unsigned high, unsigned shift)
 {

@@ -107,7 +107,7 @@ def test_a_kernel_compiles_with_all_native_code_for_the_oldest_and_the_newest(ca
 
 
 def test_worlds_of_two_blocks_compile_where_there_are_clusters(tmp_path):
-    compile_for(whole_rollout(WorldVariant(256, 8, 2, 1, 2)).module, 90, tmp_path)
+    compile_for(whole_rollout(WorldVariant(512, 8, 2, 1, 2)).module, 90, tmp_path)
     assert list(tmp_path.glob("*.sm90.cubin"))
 
 

@@ -167,6 +167,7 @@ def exact_rollout(x, s, rule, masks, noise, side):
         pytest.param(100, 5, 2, 1, "smooth", None, marks=pytest.mark.slow),
         (200, 16, 4, 1, "threshold", 0.3),
         pytest.param(128, 16, 8, 1, "threshold", None, marks=pytest.mark.slow),
+        pytest.param(400, 8, 8, 1, "threshold", None, marks=pytest.mark.slow),
     ],
 )
 def test_whole_rollouts_are_those_of_the_reference(

@@ -113,30 +113,44 @@ struct Bounds {
     }
 };
 
-// A bit for each block of eight particles of which one is within a distance of the bounds.
+// Bits for the blocks of eight particles of a world.
+template <bool WIDE> struct BlockBits { using Type = unsigned; };
+template <> struct BlockBits<true> { using Type = unsigned long long; };
+
+__device__ inline int first_block(unsigned bits) { return __ffs(bits) - 1; }
+__device__ inline int first_block(unsigned long long bits) { return __ffsll(bits) - 1; }
+
+// Those of which a particle is within a distance of the bounds.
 template <int N>
-__device__ inline unsigned blocks_near(const float2* places, const Bounds& bounds, float distance)
+__device__ inline auto blocks_near(const float2* places, const Bounds& bounds, float distance)
 {
-    if constexpr (N <= 64) return (1u << N / 8) - 1u;
+    using Bits = typename BlockBits<(N > 256)>::Type;
+    if constexpr (N <= 64) return (Bits(1) << N / 8) - 1;
     const unsigned lane = threadIdx.x & 31u;
     const float x = 0.5f * (bounds.left + bounds.right), y = 0.5f * (bounds.low + bounds.high);
     const float width = 0.5f * (bounds.right - bounds.left), height = 0.5f * (bounds.high - bounds.low);
     // Far from the origin these are rounded.
     distance = fmaf(1e-6f, fabsf(x) + fabsf(y) + width + height, distance);
-    float nearest = 3e38f;
-    if (lane < N / 8) {
-        #pragma unroll
-        for (int c = 0; c < 4; ++c) {
-            // In another order in each lane, which avoids bank conflicts.
-            const float4 two = reinterpret_cast<const float4*>(places)[lane * 4 + ((c + (lane >> 1)) & 3)];
-            const float ax = fmaxf(fabsf(two.x - x) - width, 0.0f), ay = fmaxf(fabsf(two.y - y) - height, 0.0f);
-            const float bx = fmaxf(fabsf(two.z - x) - width, 0.0f), by = fmaxf(fabsf(two.w - y) - height, 0.0f);
-            nearest = fminf(nearest, fminf(fmaf(ax, ax, ay * ay), fmaf(bx, bx, by * by)));
+    Bits near = 0;
+    #pragma unroll
+    for (int first = 0; first < N / 8; first += 32) {
+        const unsigned block = first + lane;
+        float nearest = 3e38f;
+        if (block < N / 8) {
+            #pragma unroll
+            for (int c = 0; c < 4; ++c) {
+                // In another order in each lane, which avoids bank conflicts.
+                const float4 two = reinterpret_cast<const float4*>(places)[block * 4 + ((c + (lane >> 1)) & 3)];
+                const float ax = fmaxf(fabsf(two.x - x) - width, 0.0f), ay = fmaxf(fabsf(two.y - y) - height, 0.0f);
+                const float bx = fmaxf(fabsf(two.z - x) - width, 0.0f), by = fmaxf(fabsf(two.w - y) - height, 0.0f);
+                nearest = fminf(nearest, fminf(fmaf(ax, ax, ay * ay), fmaf(bx, bx, by * by)));
+            }
         }
+        // Of places so far away, or not a number, squares and roundings say nothing.
+        if (!(width + height < 1e15f)) nearest = 0.0f;
+        near |= Bits(__ballot_sync(~0u, block < N / 8 && nearest < distance * distance)) << first;
     }
-    // Of places so far away, or not a number, squares and roundings say nothing.
-    if (!(width + height < 1e15f)) nearest = 0.0f;
-    return __ballot_sync(~0u, lane < N / 8 && nearest < distance * distance);
+    return near;
 }
 
 // Weights of both layers, scaled and split as `arrange_hidden` and `arrange_output` do it, in the order
@@ -326,7 +340,7 @@ __device__ inline void sort_world(const Group& group, int step, int count, float
         for (int c = 0; c < Group::PARTS; ++c) state[o][c] = *group.state(i, c);
         const int column = min(max(__float2int_rd((place[o].x - x) * cells) + 128, 0), 255);
         const int line = min(max(__float2int_rd((place[o].y - y) * cells) + 128, 0), 255);
-        key[o] = (i < count ? hilbert_place(column, line) : 65536u) << 8 | i;
+        key[o] = (i < count ? hilbert_place(column, line) : 65536u) << 9 | i;
         keys[i] = key[o];
         rank[o] = 0;
     }
@@ -425,12 +439,12 @@ struct DensityPhase {
                 bounds.include(p);
                 bounds.template combine<1, SHARE>();
             }
-            unsigned near = blocks_near<N>(places, bounds, reach);
+            auto near = blocks_near<N>(places, bounds, reach);
             // Sums over halves of blocks, as two threads of a particle have them.
             float sums[2][2] = {};
             float4 pairs[4 / THREADS];
             auto fetch = [&] {
-                const int block = near ? __ffs(near) - 1 : N / 8;
+                const int block = near ? first_block(near) : N / 8;
                 #pragma unroll
                 for (int c = 0; c < 4 / THREADS; ++c)
                     pairs[c] = reinterpret_cast<const float4*>(places)[block * 4 + side * 2 + c];
@@ -482,10 +496,10 @@ template <int BLOCKS> struct Perception {
     float fields[4][BLOCKS][2][2];  // States, smoothed states, gradients along x and y.
     float density[2][2];            // Density gradients.
 
-    template <int N, typename Group>
+    template <int N, typename Group, typename Bits>
     __device__ void sum(
         const Group& group, const RolloutNumbers& numbers, const RolloutChoices& choices,
-        const int (&index)[2], const float2 (&p)[2], unsigned near, float state_unscale)
+        const int (&index)[2], const float2 (&p)[2], Bits near, float state_unscale)
     {
         const int lane = threadIdx.x & 31, t = lane & 3;
         constexpr int ROW = Group::Memory::ROW;
@@ -499,9 +513,9 @@ template <int BLOCKS> struct Perception {
         unsigned left[3][4], rest[3][4], at = 0u, next = 0u;
         float4 neighbours[2][2];
         auto fetch = [&] {
-            const int a = __ffs(near) - 1;
+            const int a = first_block(near);
             near &= near - 1;
-            const int b = near ? __ffs(near) - 1 : N / 8;
+            const int b = near ? first_block(near) : N / 8;
             near &= near - 1;
             next = rows + (lane & 8 ? b : a) * (8 * ROW);
             #pragma unroll

@@ -13,7 +13,7 @@ from npa_envs.kernels import native_functions as native
 SHARED_BYTES = 225 * 1024
 """Shared memory of a block [bytes]: on compute capability 9.0 the most, without 2 KiB for Warp."""
 
-SIZES = (64, 128, 256)
+SIZES = (64, 128, 256, 512)
 """Numbers of particles that worlds are filled up to."""
 
 MIN_PARTICLES = 32
@@ -60,7 +60,7 @@ def fits_block(particle_count: int, state_dim: int, hidden_dim: int) -> bool:
     if not MIN_PARTICLES <= particle_count <= SIZES[-1] or state_dim > MAX_CHANNELS:
         return False
     size = world_size(particle_count)
-    shared = WorldVariant(size, 1, 1, 2 * SIZES[-1] // size, channel_blocks(state_dim))
+    shared = WorldVariant(size, 1, 1, SIZES[-1] // size, channel_blocks(state_dim))
     return shared.memory(hidden_dim) <= SHARED_BYTES
 
 
