@@ -69,11 +69,10 @@ class TextureEnv(NPAEnv):
 
     The particles' picture, which has no seam, is compared with the target on `resolution` ×
     `resolution` pixels. The texture loss ignores positions. It compares the distributions of
-    patches of several sizes (`"patch_swd"`), responses of random filters (`"filter_swd"`), or
-    features of VGG16 (`"vgg_ot"`). The loss L is `colour_weight` times the loss of the colour image
-    plus `density_weight` times the loss of the density image. 0 is the same texture. Joint losses
-    such as `"patch_ot"` see both images at once. Their density term is 0. Formulas:
-    [textures](../mathematics.md#textures).
+    patches of several sizes (`"patch_swd"`) or of features of VGG16 (`"vgg_ot"`). The loss L is
+    `colour_weight` times the loss of the colour image plus `density_weight` times the loss of the
+    density image. 0 is the same texture. Joint losses such as `"patch_ot"` see both images at once.
+    Their density term is 0. Formulas: [textures](../mathematics.md#textures).
 
     A particle's own loss is what its part of the picture adds to the texture loss, to first order.
 

@@ -7,11 +7,9 @@ is what the error calls the value.
 from __future__ import annotations
 
 import contextlib
-import functools
 import math
 import operator
 import sys
-import threading
 from collections.abc import Callable, Sequence
 from typing import Any, Literal, TypeGuard, TypeVar
 
@@ -156,11 +154,10 @@ def check_device(name: str | torch.device) -> torch.device:
 class FiniteCheck:
     """A check that all positions are finite: it starts when it is made, and `wait` raises.
 
-    x must not change until `wait` returns. With a CUDA event `ready`, the check runs on another
-    stream, after that event.
+    x must not change until `wait` returns.
     """
 
-    def __init__(self, x: Tensor, ready: torch.cuda.Event | None = None) -> None:
+    def __init__(self, x: Tensor) -> None:
         self._x = x.detach()
         self._copied: torch.cuda.Event | None = None
         # The largest absolute value, NaN if there is any NaN, takes one kernel.
@@ -168,11 +165,7 @@ class FiniteCheck:
         if not x.is_cuda:
             self._size = torch.linalg.vector_norm(self._x, math.inf)
             return
-        if ready is None:
-            stream = torch.cuda.current_stream(x.device)
-        else:
-            stream = _side_stream(x.device, threading.get_ident())
-            stream.wait_event(ready)
+        stream = torch.cuda.current_stream(x.device)
         # `torch.cuda.stream(stream)` would take half of the time of a call of few steps.
         with stream:
             on_host = torch.empty((), dtype=x.dtype, device="cpu", pin_memory=True)
@@ -193,12 +186,6 @@ class FiniteCheck:
             f"x must be finite, got {self._x[world, particle].tolist()} at world {world}, particle "
             f"{particle} ({int((~finite).sum())} such particles): reset those worlds"
         )
-
-
-@functools.lru_cache(maxsize=64)
-def _side_stream(device: torch.device, thread: int) -> torch.cuda.Stream:
-    """Return a thread's stream for checks: one thread at a time can enter a stream's context."""
-    return torch.cuda.Stream(device)  # type: ignore[no-untyped-call]
 
 
 def constant(number: float) -> float:

@@ -17,7 +17,6 @@ GROUPS = {
     "make": {
         "demo": "grow a shipped rule, damage it, let it heal; train a small one: a minute on a CPU",
         "train": "with a target (picture, texture, class): train a rule by the loss's gradient",
-        "sweep": "train with every combination of some options, over devices and machines",
         "search": "without a target: search for rules that differ from each other and stay alive",
     },
     "look": {

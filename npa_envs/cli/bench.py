@@ -21,7 +21,7 @@ class BenchOptions(common.MeasureOptions):
     """
 
     suite: str | None = None
-    """quick (the default), paper, scaling, skips, species or kernels."""
+    """quick (the default), paper, scaling or kernels."""
     quick: bool = False
     """Small worlds only: about a minute on a CPU."""
     repeats: int = 7

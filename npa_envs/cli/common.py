@@ -219,23 +219,6 @@ def writable_folder(path: Path, name: str = "out") -> Path:
 
 
 @dataclass(frozen=True, kw_only=True)
-class TimeLimitOptions:
-    """The option of commands that start several runs or measurements."""
-
-    max_seconds: float = math.inf
-    """Start nothing more after this time [s]; what is done is kept."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class PartOptions(TimeLimitOptions):
-    """Options of commands that distribute runs over devices and machines."""
-
-    part: Annotated[str | None, tyro.conf.arg(metavar="K/N")] = None
-    """Run only the K-th of N parts: several machines, or tasks of a scheduler's array, run one part
-    each, all with the same --out on a shared disk."""
-
-
-@dataclass(frozen=True, kw_only=True)
 class SharedRunOptions:
     """Options of runs that are resumed, and shared by processes."""
 
@@ -253,9 +236,11 @@ class SharedRunOptions:
 
 
 @dataclass(frozen=True, kw_only=True)
-class MeasureOptions(RunOptions, TimeLimitOptions):
+class MeasureOptions(RunOptions):
     """Options of the commands that measure and keep records."""
 
+    max_seconds: float = math.inf
+    """Start nothing more after this time [s]; what is done is kept."""
     threads: int = 1
     """CPU threads of torch and the kernels in each run; they change times, not other results."""
     commit: str | None = None

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, kw_only=True)
-class CompareOptions(common.PartOptions, common.MeasureOptions):
+class CompareOptions(common.MeasureOptions):
     """Compare methods on tasks over seeds, for equal wall time, equal particle-steps, or both.
 
     Each run learns in its own process. A failed run is recorded with its error, and the others
@@ -68,6 +68,9 @@ class CompareOptions(common.PartOptions, common.MeasureOptions):
     jobs: int | None = None
     """Runs at the same time; default: one for each device. With --learning-seconds each device must
     have the same number, as runs on one device share its time."""
+    part: Annotated[str | None, tyro.conf.arg(metavar="K/N")] = None
+    """Run only the K-th of N parts: several machines, or tasks of a scheduler's array, run one part
+    each, all with the same --out on a shared disk."""
 
 
 def main(arguments: Sequence[str]) -> int:

@@ -34,7 +34,7 @@ class StressOptions(common.MeasureOptions):
     """Groups (geometry, values, time, gradients, precision), checks (time/gecko), or beginnings of
     names (geometry/clump); default: all."""
     out: Path | None = None
-    """Folder for stress_DEVICE.json and heat maps (extra `bench`); default: nothing is written."""
+    """Folder for stress_DEVICE.json; default: nothing is written."""
     only_list: Annotated[bool, tyro.conf.arg(name="list")] = False
     """Run nothing: print the checks and what each expects."""
 
@@ -45,7 +45,6 @@ def main(arguments: Sequence[str]) -> int:
     from npa_envs.measure import accuracy
     from npa_envs.measure.accuracy import check_runner
     from npa_envs.measure.benchmark_records import measured_facts
-    from npa_envs.measure.plots import write_plots
 
     common.check_numbers(options, threads=1)
     rules = common.named_rules(options.rules)
@@ -75,7 +74,5 @@ def main(arguments: Sequence[str]) -> int:
         )  # fmt: skip
     print(record.text())
     if path is not None:
-        maps = path.with_name(f"{path.stem}_*.png")
-        drawn = write_plots(lambda: check_runner.heat_maps(record), maps, "heat maps")
-        print("\n".join([f"wrote {path}", *drawn]))
+        print(f"wrote {path}")
     return 1 if record.counts()["fail"] else 0

@@ -27,6 +27,7 @@ CUDA_ONLY = (
     "cuda/adjoint.cuh",
     "cuda/network.cuh",
     "cuda/equivariance.cuh",
+    "cuda/whole_rollout.cuh",
     "pictures/warp_sums.cuh",
     "pictures/tiles_by_work.cuh",
 )

@@ -21,8 +21,11 @@ from npa_envs.kernels.cuda.density import MIN_SIDE
 from npa_envs.kernels.cuda.equivariance import fits_block
 from npa_envs.kernels.cuda.network import WARP_UNITS
 from npa_envs.kernels.cuda.sort import BLOCKS, MAX_GRID
+from npa_envs.kernels.cuda.whole_rollout import MAX_CHANNELS, MIN_PARTICLES, SIZES
+from npa_envs.kernels.cuda.whole_rollout import fits_block as world_fits_block
+from npa_envs.ops.physics import Boundary
 
-Operator = Literal["sort", "density", "adjoint", "vectors", "network"]
+Operator = Literal["rollout", "sort", "density", "adjoint", "vectors", "network"]
 
 MAX_ROW, MAX_UPDATE, MAX_HIDDEN = 128, 32, 512
 """Maximum numbers of columns of rows, of columns of updates, and of hidden units, that the CUDA
@@ -67,6 +70,12 @@ class KernelRequest(NamedTuple):
     """Hidden units of the rule, H."""
     vectors: tuple[int, int, int, int, bool] | None = None
     """The `VectorSizes` of an equivariant rule."""
+    rollout: bool = False
+    """Whether it is a rollout of one plain rule whose particles move, without gradients."""
+    boundary: Boundary = "open"
+    """Boundary of a rollout's worlds."""
+    state_dim: int = 0
+    """State channels C of a rollout."""
     for_environments: bool = False
     """Whether environments perceive, whose batches fill a GPU, and not rollouts."""
 
@@ -128,9 +137,36 @@ def _fused(request: KernelRequest) -> bool:
     )
 
 
+def _whole(request: KernelRequest) -> bool:
+    return (
+        request.rollout
+        and _cuda(request)
+        and torch.cuda.get_device_capability(request.device) == (9, 0)
+        and request.space_dim == 2
+        and request.boundary != "periodic"
+        and world_fits_block(request.particle_count, request.state_dim, request.hidden_dim)
+    )
+
+
 _MODERN = "CUDA from compute capability 8.0 on, float32"
 
 TABLE: tuple[Implementation, ...] = (
+    Implementation(
+        "rollout",
+        "whole",
+        "kernels/cuda/whole_rollout.py",
+        "cuda_graph='whole', CUDA of compute capability 9.0, float32, 2D, no periodic box, "
+        f"{MIN_PARTICLES} to {SIZES[-1]} particles with at most {MAX_CHANNELS} channels, worlds "
+        "that fit into shared memory with the rule: a few warps run all steps of a world",
+        _whole,
+    ),
+    Implementation(
+        "rollout",
+        "steps",
+        "world/steps.py",
+        "otherwise: launches of each step",
+        lambda request: request.rollout,
+    ),
     Implementation(
         "sort",
         "block",

@@ -106,7 +106,7 @@ class DriverLaunch:
         )
         self._device = device
         self._block = launch.block_dim
-        driver = None if launch.cluster_dim > 1 else _driver()
+        driver = _driver()
         self._launch = None if driver is None else driver.cuLaunchKernelEx
         self._function = ctypes.c_void_p(launch.hooks.forward)
         self._addresses = addresses

@@ -18,7 +18,7 @@ from torch.autograd import forward_ad
 from torch.utils._python_dispatch import is_in_torch_dispatch_mode
 
 from npa_envs.errors import NPAError
-from npa_envs.ops.launch import tracing
+from npa_envs.ops.launch import repeated, tracing
 from npa_envs.ops.physics import Physics
 
 Arguments = ParamSpec("Arguments")
@@ -87,13 +87,15 @@ class CustomOp(Generic[Arguments, Result]):
     """A function of tensors that is called directly, or as a torch operator where torch needs one.
 
     It needs one under torch.compile, in dispatch modes and for tensor subclasses. Elsewhere an
-    operator's call would cost as much CPU time as several launches. Arguments are positional.
+    operator's call would cost as much CPU time as several launches, and later calls repeat the
+    launches of earlier ones (`npa_envs.ops.launch.repeated`). On a CPU only operators `of_all`
+    particles do so: numbers of active ones change in each step. Arguments are positional.
     Results share no memory with each other or with arguments. The operator takes a `Physics` as the
     list `Physics.numbers`. With torch's fake tensors, which have no memory, nothing is launched.
     """
 
-    def __init__(self, name: str, function: Callable[Arguments, Result]) -> None:
-        self._function = function
+    def __init__(self, name: str, function: Callable[Arguments, Result], of_all: bool) -> None:
+        self._function, self._of_all = function, of_all
         self._signature = inspect.signature(function, eval_str=True)
         self._operator = torch.library.custom_op(
             name, self._taking_lists(function), mutates_args=()
@@ -130,12 +132,17 @@ class CustomOp(Generic[Arguments, Result]):
             flat = [value.numbers() if isinstance(value, Physics) else value for value in args]
             result: Result = self._operator(*flat)
             return result
-        return self._function(*args, **kwargs)
+        if not (self._of_all or getattr(args[0], "is_cuda", False)):
+            return self._function(*args, **kwargs)
+        made: Result = repeated(self._function, args)
+        return made
 
 
-def custom_op(name: str) -> Callable[[Callable[Arguments, Result]], CustomOp[Arguments, Result]]:
+def custom_op(
+    name: str, *, of_all: bool = False
+) -> Callable[[Callable[Arguments, Result]], CustomOp[Arguments, Result]]:
     """Return a decorator that makes a function of tensors the operator `name`, "npa::..."."""
-    return lambda function: CustomOp(name, function)
+    return lambda function: CustomOp(name, function, of_all)
 
 
 def without_autocast(backward: Callable[Arguments, Result]) -> Callable[Arguments, Result]:

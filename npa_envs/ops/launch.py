@@ -1,28 +1,33 @@
 """Launches of Warp kernels on tensors, on torch's current stream or on CPU threads.
 
-There are three ways to launch a kernel, each with less CPU time than the one before:
+There are four ways to launch a kernel, each with less CPU time than the one before:
 
 - The first `launch` of a kernel on a device has Warp compile and load the kernel and pack its
   arguments. The thread keeps the result, a `_PreparedLaunch`.
 - Each later `launch` of it overwrites the arguments that changed, and repeats the prepared launch.
 - `RecordedLaunches` keeps a sequence of prepared launches, each with arguments of its own, and
   replays them. Between replays only the addresses of chosen tensors can be changed.
+- `repeated` does so for a whole operator: from the third call with tensors of the same forms on, it
+  allocates results, and one block of memory for all other tensors, and repeats the launches.
 """
 
 from __future__ import annotations
 
+import collections
 import contextlib
 import ctypes
 import functools
 import inspect
+import itertools
 import math
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Hashable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import torch
 import warp as wp
-from torch import Tensor
+from torch import Tensor, nn
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from npa_envs.compile_lock import cached_under_lock, kernel_lock
 from npa_envs.errors import NPAError
@@ -65,6 +70,8 @@ class _ThreadState(threading.local):
         """Sequence to which this thread's launches are appended; None: they are not recorded."""
         self.traced = False
         """Whether tensors have no memory, so that nothing is launched."""
+        self.calls: collections.OrderedDict[Hashable, int | _Repeat] = collections.OrderedDict()
+        """Number of an operator's calls, or their launches, by function and forms of arguments."""
 
 
 _thread = _ThreadState()
@@ -118,8 +125,12 @@ def is_traced() -> bool:
     return _thread.traced
 
 
-def is_aligned(tensor: Tensor, size: int = 16) -> bool:
-    """Return whether a tensor begins at a multiple of `size` bytes in memory."""
+ALIGNED_BYTES = 16
+"""Largest alignment of tensors that a choice of kernels depends on [bytes]."""
+
+
+def is_aligned(tensor: Tensor, size: int = ALIGNED_BYTES) -> bool:
+    """Return whether a tensor begins at a multiple of `size` bytes, at most `ALIGNED_BYTES`."""
     return _thread.traced or tensor.data_ptr() % size == 0
 
 
@@ -179,14 +190,14 @@ class _PreparedLaunch:
         self._bounds: dict[tuple[int, ...], Any] = {}
         parameters = packed.params[1:]
         fields = [(f"a{k}", type(value)) for k, value in enumerate(parameters)]
-        self._memory: Any = _argument_struct(tuple(fields))(*parameters)
+        self.memory: Any = _argument_struct(tuple(fields))(*parameters)
         """Struct of all arguments, which the kernel reads."""
-        self._names = [name for name, _ in fields]
+        self.names = [name for name, _ in fields]
         self._writers: list[tuple[int, Callable[[Any], None]]] = []
         """Index of each argument that is an array or a struct, and the function that writes it."""
         self._number_indices: list[int] = []
-        for k, (name, argument) in enumerate(zip(self._names, packed.kernel.adj.args, strict=True)):
-            memory, declared = getattr(self._memory, name), _type_of(argument)
+        for k, (name, argument) in enumerate(zip(self.names, packed.kernel.adj.args, strict=True)):
+            memory, declared = getattr(self.memory, name), _type_of(argument)
             if isinstance(declared, wp.array):
                 self._writers.append((k, _ArrayArgument(memory, declared).set))
             elif hasattr(arguments[k], "__ctype__"):
@@ -206,11 +217,11 @@ class _PreparedLaunch:
                 last[k] = value
                 declared = self._warp_launch.kernel.adj.args[k].type
                 number = declared(*value) if isinstance(value, tuple) else value
-                setattr(self._memory, self._names[k], number)
+                setattr(self.memory, self.names[k], number)
 
     def set_address(self, index: int, tensor: Tensor) -> None:
         """Point an array argument at another tensor of the same shape and dtype."""
-        getattr(self._memory, self._names[index]).data = tensor.data_ptr() or _empty_address(tensor)
+        getattr(self.memory, self.names[index]).data = tensor.data_ptr() or _empty_address(tensor)
 
     def run(self, size: tuple[int, ...]) -> None:
         """Launch the kernel with `size` threads along each dimension."""
@@ -243,12 +254,12 @@ class _CpuLaunch(_PreparedLaunch):
         if len(ranges) > 1:
             run_together([functools.partial(self._run_range, size, part) for part in ranges])
         else:
-            self._run_in_this_thread(self._memory, size)
+            self._run_in_this_thread(self.memory, size)
 
     def _run_range(self, size: tuple[int, ...], indices: range) -> None:
         """Run the threads whose first index is in `indices`, on a copy of the arguments."""
-        memory = type(self._memory).from_buffer_copy(self._memory)
-        setattr(memory, self._names[0], indices.start)
+        memory = type(self.memory).from_buffer_copy(self.memory)
+        setattr(memory, self.names[0], indices.start)
         self._run_in_this_thread(memory, (len(indices), *size[1:]))
 
     def _run_in_this_thread(self, memory: Any, size: tuple[int, ...]) -> None:
@@ -260,8 +271,8 @@ class _CudaLaunch(_PreparedLaunch):
 
     def __init__(self, packed: Any, device: torch.device, *arguments: Any) -> None:
         super().__init__(packed, device, *arguments)
-        begin, layout = ctypes.addressof(self._memory), type(self._memory)
-        addresses = [begin + getattr(layout, name).offset for name in self._names]
+        begin, layout = ctypes.addressof(self.memory), type(self.memory)
+        addresses = [begin + getattr(layout, name).offset for name in self.names]
         self._addresses = (ctypes.c_void_p * (1 + len(addresses)))(0, *addresses)
         """Addresses of the launch's size, which `run` writes, and of each argument."""
         packed.params_addr = self._addresses
@@ -366,16 +377,12 @@ class _StructArgument:
             self._last = value
 
 
-def is_recording() -> bool:
-    """Return whether this thread records its launches."""
-    return _thread.recording is not None
-
-
 class RecordedLaunches:
     """A sequence of launches to replay with the same arguments, but for tensors that are moved."""
 
     def __init__(self) -> None:
-        self._launches: list[tuple[_PreparedLaunch, tuple[int, ...]]] = []
+        self.launches: list[tuple[_PreparedLaunch, tuple[int, ...]]] = []
+        """All launches and their sizes."""
         self._tensors: list[list[Any]] = []
         """Tensors in the arguments, kept alive: the arguments contain only their addresses."""
 
@@ -392,7 +399,7 @@ class RecordedLaunches:
         arguments = (0, *arguments) if kernel in MIN_RANGES else arguments
         prepared = _prepare(kernel, size, device, block_dim, *arguments)
         prepared.set(arguments)
-        self._launches.append((prepared, size))
+        self.launches.append((prepared, size))
         self._tensors.append(list(arguments))
         return prepared
 
@@ -407,12 +414,21 @@ class RecordedLaunches:
 
     def __len__(self) -> int:
         """Return the number of launches."""
-        return len(self._launches)
+        return len(self.launches)
+
+    def addresses(self) -> Iterator[tuple[Any, Tensor]]:
+        """Yield each tensor that is not empty, with the number that is its address in arguments."""
+        for (prepared, _), arguments in zip(self.launches, self._tensors, strict=True):
+            for k, value in enumerate(arguments):
+                if isinstance(value, Tensor) and value.numel():
+                    descriptor = getattr(prepared.memory, prepared.names[k])
+                    offset = type(descriptor).data.offset
+                    yield ctypes.c_uint64.from_buffer(descriptor, offset), value
 
     def argument_slots(self, tensor: Tensor) -> list[tuple[_PreparedLaunch, int]]:
         """Return launches and indices whose argument is `tensor`, which the caller keeps alive."""
         slots, address = [], tensor.data_ptr()
-        for (prepared, _), arguments in zip(self._launches, self._tensors, strict=True):
+        for (prepared, _), arguments in zip(self.launches, self._tensors, strict=True):
             for k, value in enumerate(arguments):
                 if isinstance(value, Tensor) and value.data_ptr() == address:
                     arguments[k] = None
@@ -428,11 +444,140 @@ class RecordedLaunches:
         self, begin: int = 0, end: int | None = None, *, last_count: int | None = None
     ) -> None:
         """Repeat launches [begin, end); `last_count` replaces the first size of the last one."""
-        launches = self._launches[begin:end]
+        launches = self.launches[begin:end]
         for prepared, size in launches[:-1]:
             prepared.run(size)
         prepared, size = launches[-1]
         prepared.run(size if last_count is None else (last_count, *size[1:]))
+
+
+MAX_REPEATED = 128
+"""Maximum number of kinds of operator calls that a thread counts."""
+
+CALLED_FIRST = 2
+"""Number of calls of a kind before its launches are recorded."""
+
+ALIGNMENT = 512
+"""Alignment of tensors within a block of memory [bytes], that of torch's allocators."""
+
+
+def repeated(function: Callable[..., Any], arguments: Sequence[Any]) -> Any:
+    """Return `function(*arguments)`, from the third call of a kind on by repeating its launches.
+
+    The function allocates and launches. All else that it does must follow from numbers in the
+    arguments, and from the tensors' shapes, dtypes, devices and alignment. If it calls any other
+    operator of torch, it is always called. Results are new tensors in each call.
+    """
+    if _thread.traced or _thread.recording is not None or _observers:
+        return function(*arguments)
+    tensors: list[Tensor] = []
+    key: list[Hashable] = [function]
+    for argument in arguments:
+        several = type(argument) is list
+        for value in argument if several else (argument,):
+            if isinstance(value, Tensor):
+                if type(value) not in (Tensor, nn.Parameter) or not value.is_contiguous():
+                    return function(*arguments)
+                tensors.append(value)
+                place = value.data_ptr() % ALIGNED_BYTES
+                key += (value.shape, value.dtype, value.device, place)
+            else:
+                key.append(value)
+        key.append(several)
+    of_thread, kind = _thread.calls, tuple(key)
+    calls = of_thread.pop(kind, 0)
+    of_thread[kind] = calls if isinstance(calls, _Repeat) else calls + 1
+    if len(of_thread) > MAX_REPEATED:
+        of_thread.popitem(last=False)
+    if isinstance(calls, _Repeat):
+        return calls.run(tensors)
+    if calls != CALLED_FIRST:
+        return function(*arguments)
+    recorded, watch = RecordedLaunches(), _WatchedOperators()
+    with recorded.recording(), watch:
+        results = function(*arguments)
+    if watch.only_allocates:
+        with contextlib.suppress(LookupError):
+            of_thread[kind] = _Repeat(recorded, tensors, results, watch.allocated)
+    return results
+
+
+class _WatchedOperators(TorchDispatchMode):
+    """Notes whether torch's operators in the block only allocate memory, and make views of it."""
+
+    def __init__(self) -> None:
+        super().__init__()  # type: ignore[no-untyped-call]
+        self.only_allocates = True
+        self.allocated: set[int] = set()
+        """Addresses of the memory."""
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        """Run an operator of torch."""
+        result = func(*args, **(kwargs or {}))
+        if func.name().startswith(("aten::empty", "aten::new_empty")):
+            self.allocated.add(result.untyped_storage().data_ptr())
+        else:
+            self.only_allocates &= func.is_view
+        return result
+
+
+class _Repeat:
+    """The launches of an operator's call, to repeat with other tensors of the same forms.
+
+    Raises LookupError if tensors share memory, or are neither arguments nor `allocated`.
+    """
+
+    def __init__(
+        self,
+        recorded: RecordedLaunches,
+        inputs: Sequence[Tensor],
+        results: Any,
+        allocated: set[int],
+    ) -> None:
+        self._several = None if isinstance(results, Tensor) else type(results)
+        made: list[Tensor] = [results] if self._several is None else [*results]
+        self._forms = [(each.shape, each.dtype, each.device) for each in made]
+        self._launches, self._block_bytes = recorded.launches, 0
+        self._addresses: list[tuple[Any, int, int]] = []
+        """Addresses in arguments, each with the index of a result or input, and a distance [bytes]
+        from its begin; the index after the last is that of the block for all other tensors."""
+        regions = [(each.data_ptr(), each.data_ptr() + each.nbytes) for each in (*made, *inputs)]
+        filled = sorted(region for region in regions if region[0] < region[1])
+        if any(end > begin for (_, end), (begin, _) in itertools.pairwise(filled)):
+            raise LookupError("tensors share memory")
+        places: dict[int, int] = {}
+        for address, tensor in recorded.addresses():
+            storage, begin = tensor.untyped_storage(), tensor.data_ptr()
+            extents = zip(tensor.shape, tensor.stride(), strict=True)
+            end = begin + (1 + sum((n - 1) * stride for n, stride in extents)) * tensor.itemsize
+            owners = [k for k, (first, last) in enumerate(regions) if first <= begin < last]
+            whole = storage.data_ptr()
+            if owners:
+                index, distance = owners[0], begin - regions[owners[0]][0]
+                if end > regions[index][1]:
+                    raise LookupError("an array is larger than the tensor that it begins in")
+            elif whole in allocated:
+                if whole not in places:
+                    places[whole] = self._block_bytes
+                    self._block_bytes += -(-storage.nbytes() // ALIGNMENT) * ALIGNMENT
+                index, distance = len(regions), places[whole] + begin - whole
+            else:
+                raise LookupError("a tensor is not one of the call's")
+            self._addresses.append((address, index, distance))
+
+    def run(self, inputs: Sequence[Tensor]) -> Any:
+        """Return the operator's results for other tensors."""
+        made = [torch.empty(shape, dtype=dtype, device=on) for shape, dtype, on in self._forms]
+        begins = [tensor.data_ptr() for tensor in (*made, *inputs)]
+        if self._block_bytes:
+            device = inputs[0].device
+            block = torch.empty(self._block_bytes, dtype=torch.uint8, device=device)
+            begins.append(block.data_ptr())
+        for address, index, distance in self._addresses:
+            address.value = begins[index] + distance
+        for prepared, size in self._launches:
+            prepared.run(size)
+        return made[0] if self._several is None else self._several(made)
 
 
 class NotedLaunch(NamedTuple):

@@ -16,7 +16,6 @@ from torch import Tensor
 from npa_envs.checks import (
     Box,
     MomentInverse,
-    check_finite_positions,
     check_world,
     checked_choice,
     checked_eps,
@@ -28,12 +27,15 @@ from npa_envs.ops.perception_passes import (
     SavedPerception,
     compute_densities,
     compute_densities_in_cells,
+    perceive_backward,
     perceive_rows_backward,
     perception_launch,
     portable_kernels,
+    saved_together,
 )
 from npa_envs.ops.physics import ALL_TERMS, Physics, Terms, make_physics
-from npa_envs.ops.sort import plan_kernels, sort_worlds
+from npa_envs.ops.position_check import checked_positions
+from npa_envs.ops.sort import SortedWorlds, plan_kernels, sort_worlds
 from npa_envs.ops.static_worlds import StaticRows, StaticWorlds, static_worlds
 
 
@@ -90,7 +92,8 @@ def perceive(
             (det M adj M + τ² I) / (det² M + τ²), τ = 1e-2, which nears both and never jumps.
 
     Returns:
-        Perception vectors z, dimensionless, shape [B, N, P], P = C(2+D)+D with both gradients.
+        Perception vectors z, dimensionless, shape [B, N, P], P = C(2+D)+D with both gradients; the
+        backward pass reads them, so change a clone.
 
     Raises:
         NPAError: Shapes, dtypes or devices do not fit, a position is not finite, eps or eps0 is
@@ -103,29 +106,84 @@ def perceive(
         checked_flag("density_gradient", density_gradient),
     )
     physics = checked_physics(x, s, eps, eps0, box, terms)
-    perception, rows = perceive_rows(
-        x.detach() if checked_flag("detach_positions", detach_positions) else x,
-        s,
-        physics,
-        mask=None,
-        row_capacity=x.shape[0] * x.shape[1],
-        row_width=physics.perception_dim,
+    seen, states = x.contiguous(), s.contiguous()
+    if checked_flag("detach_positions", detach_positions):
+        seen = seen.detach()
+    perception: Tensor
+    with checked_positions(seen):
+        if torch.is_grad_enabled() and (seen.requires_grad or states.requires_grad):
+            perception = _Perceive.apply(seen, states, physics)  # type: ignore[no-untyped-call]
+        else:
+            perception, _ = _perceive(seen, states, physics, False, False)
+    return perception
+
+
+@custom_op("npa::perceive", of_all=True)
+def _perceive(
+    x: Tensor, s: Tensor, physics: Physics, for_adjoint: bool, with_positions: bool
+) -> tuple[Tensor, Tensor]:
+    """Return every particle's perception, [B, N, P], and a block of bytes for the backward pass."""
+    world_count, particle_count, space_dim = map(int, x.shape)
+    total, state_dim = world_count * particle_count, s.shape[2]
+    plan = plan_kernels(x, x.shape, state_dim, total, False, physics)
+    out = x.new_empty(
+        world_count, particle_count, physics.terms.perception_dim(space_dim, plan.state_dim)
     )
-    return perception.index_select(0, rows.row_of).view(*x.shape[:2], -1)
+    block, saved, into = x.new_empty(0, dtype=torch.uint8), None, {}
+    if for_adjoint:
+        block, saved = saved_together(plan, out.view(total, -1), with_positions)
+        parts = saved._asdict().items()
+        into = {k: v for k, v in parts if k in SortedWorlds._fields and v is not None}
+    ordered = sort_worlds(plan, x, s, None, into=into)
+    densities = compute_densities(
+        plan, ordered, with_particles=for_adjoint, particles=saved and saved.particles
+    )
+    launch(
+        *perception_launch(
+            plan,
+            ordered,
+            densities,
+            out.view(total, -1),
+            destination=ordered.original_index,
+            row_kernel_sum=saved and saved.row_kernel_sum,
+        )
+    )
+    return out, block
+
+
+class _Perceive(torch.autograd.Function):
+    """Autograd function of `_perceive`; its backward pass is `perceive_backward`."""
+
+    @staticmethod
+    def forward(ctx: Any, x: Tensor, s: Tensor, physics: Physics) -> Tensor:
+        perception: Tensor
+        perception, block = _perceive(x, s, physics, True, ctx.needs_input_grad[0])
+        ctx.shapes, ctx.physics = (x.shape, s.shape), physics
+        ctx.save_for_backward(perception, block)
+        return perception
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, bar: Tensor) -> tuple[Tensor | None, ...]:
+        perception, block = ctx.saved_tensors
+        x_shape, s_shape = ctx.shapes
+        bar, moving = bar.contiguous(), ctx.needs_input_grad[0]
+        states_bar, positions_bar = perceive_backward(
+            bar, perception, block, x_shape[2], s_shape[2], moving, ctx.physics
+        )
+        return positions_bar.view(x_shape) if moving else None, states_bar.view(s_shape), None
 
 
 def checked_physics(
     x: Tensor, s: Tensor, eps: float, eps0: float | None, box: Box, terms: Terms = ALL_TERMS
 ) -> Physics:
-    """Check worlds to perceive and constants; return the constants as a `Physics`."""
+    """Check worlds to perceive, except values, and constants; return these as a `Physics`."""
     check_world(x, s)
     check_derivatives(x=x, s=s)
     space_dim, state_dim = x.shape[2], s.shape[2]
     if eps0 is not None:
         eps0 = checked_eps("eps0", eps0, space_dim, x.dtype)
-    physics = make_physics(space_dim, state_dim, x.dtype, eps=eps, eps0=eps0, box=box, terms=terms)
-    check_finite_positions(x)
-    return physics
+    return make_physics(space_dim, state_dim, x.dtype, eps=eps, eps0=eps0, box=box, terms=terms)
 
 
 @torch.no_grad()
@@ -143,21 +201,28 @@ def perception_fields(
     """
     inverse = checked_choice("moment_inverse", moment_inverse, get_args(MomentInverse))
     physics = checked_physics(x, s, eps, None, box, Terms(moment_inverse=inverse))
-    world_count, particle_count, space_dim = x.shape
-    state_dim = s.shape[2]
-    x, s = x.contiguous(), s.contiguous()
-    plan = plan_kernels(x, x.shape, state_dim, world_count * particle_count, False, physics)
+    with checked_positions(x):
+        *fields, gradients, row_of = _gather_fields(x.contiguous(), s.contiguous(), physics)
+        fields.append(gradients[row_of].to(x.dtype).view(x.shape))
+    return PerceptionFields._make(fields)
+
+
+@custom_op("npa::perception_fields", of_all=True)
+def _gather_fields(x: Tensor, s: Tensor, physics: Physics) -> list[Tensor]:
+    """Return all fields but density gradients; then these of rows, [B N, D], and each one's row."""
+    world_count, particle_count, space_dim = worlds = tuple(map(int, x.shape))
+    shape, state_dim = worlds[:2], int(s.shape[2])
+    plan = plan_kernels(x, worlds, state_dim, world_count * particle_count, False, physics)
     ordered = sort_worlds(plan, x, s, None)
     densities = compute_densities_in_cells(plan, ordered)
-    fields = PerceptionFields(
-        rho=x.new_empty(plan.total),
-        blur=x.new_empty(plan.total, state_dim),
-        grad0=x.new_empty(plan.total, state_dim, space_dim),
-        moment=x.new_empty(plan.total, space_dim, space_dim),
-        grad1=x.new_empty(plan.total, state_dim, space_dim),
-        drho=densities.density_gradient[ordered.row_of].to(x.dtype),
-    )
     kernels = portable_kernels(plan)
+    fields = [
+        x.new_empty(shape),
+        x.new_empty(*shape, state_dim),
+        x.new_empty(*shape, state_dim, space_dim),
+        x.new_empty(*shape, space_dim, space_dim),
+        x.new_empty(*shape, state_dim, space_dim),
+    ]
     launch(
         kernels.gather_fields,
         (-(-plan.total // kernels.together), plan.group_count),
@@ -170,11 +235,9 @@ def perception_fields(
         densities.particles,
         ordered.states,
         ordered.original_index,
-        *fields[:-1],
+        *(field.flatten(0, 1) for field in fields),
     )
-    return PerceptionFields(
-        *(field.view(world_count, particle_count, *field.shape[1:]) for field in fields)
-    )
+    return [*fields, densities.density_gradient, ordered.row_of]
 
 
 class Rows(NamedTuple):

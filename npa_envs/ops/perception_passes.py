@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any, NamedTuple
 
 import torch
@@ -19,7 +20,7 @@ from npa_envs.kernels.portable.perceive import perception_kernels
 from npa_envs.kernels.portable.search import PARTICLES
 from npa_envs.ops.backend import ListLayout
 from npa_envs.ops.custom_op import custom_op
-from npa_envs.ops.launch import launch
+from npa_envs.ops.launch import ALIGNMENT, launch
 from npa_envs.ops.physics import Physics
 from npa_envs.ops.sort import MAX_INDEX, KernelPlan, SortedWorlds, plan_kernels
 
@@ -81,17 +82,20 @@ def compute_densities(
     *,
     state_index: Tensor | None = None,
     with_particles: bool = True,
+    particles: Tensor | None = None,
 ) -> Densities:
     """Return densities, with neighbour lists (CUDA) or density gradients (elsewhere).
 
     `state_index` is the index of each sorted particle's state, int32, shape [B N]; None: states are
-    sorted too. `with_particles`: also return `Densities.particles` on CUDA, for the adjoint.
+    sorted too. `with_particles`: also return `Densities.particles` on CUDA, for the adjoint, in the
+    tensor `particles`, or a new one.
     """
     if not plan.lists_neighbours:
-        return compute_densities_in_cells(plan, ordered)
+        return compute_densities_in_cells(plan, ordered, particles)
     layout, positions = plan.list_layout, ordered.positions
     records = positions.new_empty(plan.total, 4)
-    particles = positions.new_empty(plan.total if with_particles else 0, plan.space_dim + 1)
+    if particles is None:
+        particles = positions.new_empty(plan.total if with_particles else 0, plan.space_dim + 1)
     list_shape = -(-plan.row_capacity // INTERLEAVED_LISTS), layout.capacity, INTERLEAVED_LISTS
     differences = positions.new_empty(list_shape, dtype=torch.int16)
     lengths = positions.new_empty(plan.row_capacity, dtype=torch.int32)
@@ -123,10 +127,13 @@ def compute_densities(
     return Densities(particles, no_gradient, NeighbourLists(layout, differences, lengths, records))
 
 
-def compute_densities_in_cells(plan: KernelPlan, ordered: SortedWorlds) -> Densities:
+def compute_densities_in_cells(
+    plan: KernelPlan, ordered: SortedWorlds, particles: Tensor | None = None
+) -> Densities:
     """Return densities of all particles and density gradients of active ones; makes no lists."""
     positions = ordered.positions
-    particles = positions.new_empty(plan.total, plan.space_dim + 1)
+    if particles is None:
+        particles = positions.new_empty(plan.total, plan.space_dim + 1)
     density_gradient = positions.new_empty(plan.total, plan.space_dim, dtype=torch.float64)
     kernels = density_kernels(plan.space_dim, plan.scalar, plan.on_cpu)
     launch(
@@ -268,6 +275,50 @@ class SavedPerception(NamedTuple):
     """Of `SortedWorlds`; None where positions get no gradient."""
 
 
+def saved_together(
+    plan: KernelPlan, perception: Tensor, with_states: bool, block: Tensor | None = None
+) -> tuple[Tensor, SavedPerception]:
+    """Return a `SavedPerception` of all particles, all but perception within one block of bytes.
+
+    The first result is the block; `block` None: a new one.
+    """
+    total, dims = plan.total, plan.space_dim
+    indices = {"row_of": (total,), "starts": (plan.start_count,), "original_index": (total,)}
+    shapes: dict[str, tuple[int, ...]] = indices | {"row_kernel_sum": (total, dims)}
+    shapes |= {"row_positions": (total, dims), "particles": (total, dims + 1)}
+    shapes |= {"states": (total * plan.group_count, plan.width)} if with_states else {}
+    counts = [math.prod(shape) for shape in shapes.values()]
+    sizes = [-(-count * perception.itemsize // ALIGNMENT) * ALIGNMENT for count in counts]
+    if block is None:
+        block = torch.empty(sum(sizes), dtype=torch.uint8, device=perception.device)
+    parts = {}
+    for name, count, part in zip(shapes, counts, block.split_with_sizes(sizes), strict=True):
+        numbers = part.view(torch.int32 if name in indices else perception.dtype)
+        parts[name] = numbers[:count].view(shapes[name])
+    return block, SavedPerception(perception, **parts)
+
+
+@custom_op("npa::perceive_backward", of_all=True)
+def perceive_backward(
+    perception_bar: Tensor,
+    perception: Tensor,
+    block: Tensor,
+    space_dim: int,
+    state_dim: int,
+    with_positions: bool,
+    physics: Physics,
+) -> tuple[Tensor, Tensor]:
+    """Return gradients as `perceive_rows_backward`, from that of every particle, [B, N, P].
+
+    `block` is that of `saved_together`.
+    """
+    bar, rows = perception_bar.flatten(0, 1), perception.flatten(0, 1)
+    shape = (*map(int, perception.shape[:2]), space_dim)
+    plan = plan_kernels(rows, shape, state_dim, len(rows), False, physics)
+    _, saved = saved_together(plan, rows, with_positions, block)
+    return _pull_back(plan, saved, [], bar, saved.original_index)
+
+
 @custom_op("npa::perceive_rows_backward")
 def perceive_rows_backward(
     perception_bar: Tensor,
@@ -293,17 +344,23 @@ def perceive_rows_backward(
         masked,
         physics,
     )
-    bar = perception_bar.contiguous()
-    if plan.runs("adjoint", position_gradient=saved.states is not None) == "cuda":
-        states_bar = _gather_by_tiles(plan, saved, bar)
-        return states_bar, states_bar.new_empty(0)
-    return _gather_by_cells(plan, saved, static_neighbours, bar)
+    return _pull_back(plan, saved, static_neighbours, perception_bar.contiguous(), None)
 
 
-def _gather_by_cells(
-    plan: KernelPlan, saved: SavedPerception, static_neighbours: list[Tensor], bar: Tensor
+def _pull_back(
+    plan: KernelPlan,
+    saved: SavedPerception,
+    static_neighbours: list[Tensor],
+    bar: Tensor,
+    bar_row: Tensor | None,
 ) -> tuple[Tensor, Tensor]:
-    """Return both gradients of `perceive_rows_backward`, with the portable kernels."""
+    """Return both gradients of `perceive_rows_backward`.
+
+    `bar_row` is the row of perception and of `bar` of each row; None: the same.
+    """
+    if plan.runs("adjoint", position_gradient=saved.states is not None) == "cuda":
+        states_bar = _gather_by_tiles(plan, saved, bar, bar_row)
+        return states_bar, states_bar.new_empty(0)
     neighbours, ends = static_neighbours or (None, None)
     space_dim, group_count = plan.space_dim, plan.group_count
     terms, with_positions = plan.physics.terms, saved.states is not None
@@ -315,7 +372,7 @@ def _gather_by_cells(
         terms.state_gradient,
         bool(static_neighbours),
     )
-    row_bars = _unscaled_cotangents(plan, saved, kernels, bar)
+    row_bars = _unscaled_cotangents(plan, saved, kernels, bar, bar_row)
     smoothed_bar, gradient_bar, _ = row_bars
     states_bar = bar.new_empty(plan.total, plan.state_dim)
     cells = saved.starts, ends, neighbours, saved.particles, saved.original_index
@@ -332,6 +389,7 @@ def _gather_by_cells(
         *cells,
         *rows,
         bar,
+        bar_row,
         smoothed_bar,
         # Twice: in the kernel's matrices, and as its flat array of numbers.
         gradient_bar,
@@ -351,7 +409,7 @@ def _gather_by_cells(
 
 
 def _unscaled_cotangents(
-    plan: KernelPlan, saved: SavedPerception, kernels: Any, bar: Tensor
+    plan: KernelPlan, saved: SavedPerception, kernels: Any, bar: Tensor, bar_row: Tensor | None
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Return gradients of each row's smoothed states, state gradients and density gradients.
 
@@ -383,6 +441,7 @@ def _unscaled_cotangents(
         saved.starts,
         saved.perception,
         bar,
+        bar_row,
         smoothed_bar,
         gradient_bar,
         density_gradient_bar,
@@ -390,7 +449,9 @@ def _unscaled_cotangents(
     return smoothed_bar, gradient_bar, density_gradient_bar
 
 
-def _gather_by_tiles(plan: KernelPlan, saved: SavedPerception, bar: Tensor) -> Tensor:
+def _gather_by_tiles(
+    plan: KernelPlan, saved: SavedPerception, bar: Tensor, bar_row: Tensor | None
+) -> Tensor:
     """Return the gradient with respect to states, [B N, C], with the CUDA kernels in float32."""
     state_gradient = plan.physics.terms.state_gradient
     kernels = listed_adjoint(
@@ -414,6 +475,7 @@ def _gather_by_tiles(plan: KernelPlan, saved: SavedPerception, bar: Tensor) -> T
         saved.starts,
         saved.perception,
         bar,
+        bar_row,
         cotangents,
     )
     states_bar = bar.new_empty(plan.total, plan.state_dim)
@@ -434,6 +496,7 @@ def _gather_by_tiles(plan: KernelPlan, saved: SavedPerception, bar: Tensor) -> T
         *cells,
         *rows,
         bar,
+        bar_row,
         # Twice: in the kernel's vectors of channels, and as its flat array of numbers.
         cotangents,
         cotangents,

@@ -22,7 +22,7 @@ from npa_envs.ops.backend import (
     list_layout,
     multiprocessor_count,
 )
-from npa_envs.ops.launch import SCALARS, channel_width, is_aligned, is_recording, launch
+from npa_envs.ops.launch import SCALARS, channel_width, is_aligned, launch
 from npa_envs.ops.physics import Physics
 
 MAX_INDEX = 2**31 - 1
@@ -223,17 +223,23 @@ def sorts_at_once(world_count: int, particle_count: int) -> bool:
 
 
 def sort_worlds(
-    plan: KernelPlan, x: Tensor, s: Tensor | None, mask: Tensor | None, *, with_rows: bool = True
+    plan: KernelPlan,
+    x: Tensor,
+    s: Tensor | None,
+    mask: Tensor | None,
+    *,
+    with_rows: bool = True,
+    into: dict[str, Tensor] | None = None,
 ) -> SortedWorlds:
     """Return worlds sorted into cells; active particles (`mask`, uint8, [B, N]) get rows.
 
     Arguments are contiguous. `s` None: sorted states are empty. `mask` None: all particles are
-    active. Without `with_rows` tensors of rows are empty.
+    active. Without `with_rows` tensors of rows are empty. `into` has fields to write to.
     """
     # Mask entries that are read if each world counts the rows of earlier worlds.
     earlier = plan.world_count * plan.total if plan.masked else 0
     capacity = 0 if earlier > MAX_MASK else block_capacity(plan.request, x, s, mask)
-    ordered = _empty_worlds(plan, x, s is not None, with_rows)
+    ordered = _empty_worlds(plan, x, s is not None, with_rows)._replace(**into or {})
     if capacity:
         _sort_by_blocks(plan, capacity, x, s, mask, ordered)
     elif plan.runs("sort") == "world" and earlier <= MAX_THREAD_MASK:
@@ -247,7 +253,6 @@ def _sort_in_passes(
     plan: KernelPlan, x: Tensor, s: Tensor | None, mask: Tensor | None, ordered: SortedWorlds
 ) -> None:
     """Write worlds of any size to `ordered`: particles are counted, placed by cell and moved."""
-    assert not is_recording(), "torch's operations between these launches would not be recorded"
     kernels = sort_kernels(plan.space_dim, plan.scalar, plan.width)
     device, total = x.device, plan.total
     cell, arrival = torch.empty(2, total, dtype=torch.int32, device=device).unbind()

@@ -16,6 +16,7 @@ from npa_envs.ops.custom_op import custom_op
 from npa_envs.ops.launch import SCALARS, launch
 from npa_envs.ops.perceive import checked_physics, perceive
 from npa_envs.ops.physics import Physics
+from npa_envs.ops.position_check import checked_positions
 from npa_envs.ops.sort import plan_kernels, sort_worlds
 
 MAX_SPECIES = 64
@@ -110,7 +111,9 @@ def species_fields(
     """
     physics = checked_physics(x, x, eps, None, box)
     sizes = checked_counts(counts, x.shape[1])
-    return SpeciesFields(*_gather_species(x.detach().contiguous(), list(sizes), physics, False))
+    with checked_positions(x):
+        fields = _gather_species(x.detach().contiguous(), list(sizes), physics, False)
+    return SpeciesFields(*fields)
 
 
 def perceive_species(

@@ -113,7 +113,7 @@ TASKS: Mapping[str, TaskEntry] = {
         presets=TEXTURE_PRESETS,
         make=lambda config, device: Texture(config, device=device),
         targets=builtin_textures,
-        examples=("--target dots --out runs/dots", "--target wall.png --loss filter_swd"),
+        examples=("--target dots --out runs/dots", "--target wall.png --loss patch_ot"),
         fast_seconds=285.0,
         # Each world's loss is most of the work.
         paired_time=0.55,

@@ -8,6 +8,10 @@ results. So a capture serves any rule with these settings, and later calls do no
 
 Tensors for the backward pass stay in the capture's memory. Until that pass has run, the capture is
 in use, and another rollout of the group gets another capture.
+
+A rule with a network of its own is captured as `torch.cuda.make_graphed_callables` would: it must
+be a function of perception, parameters and buffers. Its first replay is compared with a launched
+rollout of the same draws, bit for bit, and only if they are equal do replays serve later calls.
 """
 
 from __future__ import annotations
@@ -16,6 +20,7 @@ import collections
 import itertools
 import logging
 from collections.abc import Hashable, Sequence
+from operator import not_
 from typing import TYPE_CHECKING, Any, Literal
 
 import torch
@@ -27,15 +32,16 @@ from npa_envs.world.captured_rollout import CapturedRollout, RolloutCall
 from npa_envs.world.cuda_graph import can_capture, capture_lock, may_be_disturbed, plain_tensors
 from npa_envs.world.particles import Particles
 from npa_envs.world.randomness import Randomness, WorldRandom, torch_generator
-from npa_envs.world.rule_settings import settings_and_weights
+from npa_envs.world.rule_settings import is_observed, settings_and_weights
 
 if TYPE_CHECKING:
     from npa_envs.world.rollout_execution import RolloutSpec
 
-CudaGraph = bool | Literal["auto"]
-"""Which rollouts are captured on CUDA: those of plain rules ("auto"), all or none."""
+CudaGraph = bool | Literal["auto", "whole"]
+"""Which rollouts are captured on CUDA: those without hooks ("auto"), all or none. "whole" is
+"auto", but one kernel runs all steps of small worlds."""
 
-CUDA_GRAPH_CHOICES: tuple[CudaGraph, ...] = ("auto", True, False)
+CUDA_GRAPH_CHOICES: tuple[CudaGraph, ...] = ("auto", "whole", True, False)
 
 LAUNCHED_FIRST = 2
 """Number of calls of a group that are launched before the next one is captured."""
@@ -66,14 +72,17 @@ def run_captured(
     """Run a checked rollout by replaying CUDA graphs; None if it has to be launched."""
     x = particles.x
     # In this order: a compiler cannot trace queries of streams.
-    if cuda_graph is False or not x.is_cuda or torch.compiler.is_compiling() or spec.steps == 0:
+    if cuda_graph is False or torch.compiler.is_compiling() or spec.steps == 0:
         return None
-    if not can_capture() or torch.cuda.is_current_stream_capturing():
+    if not _may_capture(x):
         return None
     explicit = cuda_graph is True
     plain = [rule.has_network() for rule in rules]
-    if not all(plain) and (not explicit or torch.is_autocast_enabled(x.device.type)):
-        return None
+    if not all(plain):
+        own = itertools.compress(rules, map(not_, plain))
+        observed = not explicit and any(map(is_observed, own))
+        if observed or torch.is_autocast_enabled(x.device.type):
+            return None
     forms, rule_weights = zip(*map(settings_and_weights, rules, plain), strict=True)
     weights = list(itertools.chain.from_iterable(rule_weights))
     grad_flags = _grad_flags(particles, weights)
@@ -96,6 +105,11 @@ def run_captured(
     if not all(plain) and not use.rollout.compared.issuperset(call.blocks):
         return _run_and_compare(call, group, use)
     return use.rollout.replay(call, use)
+
+
+def _may_capture(x: Tensor) -> bool:
+    """Return whether rollouts of these positions can be captured now."""
+    return x.is_cuda and can_capture() and not torch.cuda.is_current_stream_capturing()
 
 
 def _grad_flags(particles: Particles, weights: list[Tensor]) -> tuple[bool, ...]:
@@ -127,7 +141,8 @@ def _blocks(spec: RolloutSpec, *, with_gradients: bool) -> list[int]:
 def _run_and_compare(call: RolloutCall, group: CallGroup, use: CaptureUse) -> Particles:
     """Launch a rollout, compare it with its replay, and return the launched worlds.
 
-    A custom network's code may make them differ: then later calls of the group are launched.
+    A custom network's code may make them, or gradients, differ: then later calls of the group are
+    launched.
     """
     particles, weights, generator = call.particles, call.weights, call.generator
     device = particles.x.device
@@ -147,15 +162,43 @@ def _run_and_compare(call: RolloutCall, group: CallGroup, use: CaptureUse) -> Pa
     launched = call.spec.launch(step, call.rules, worlds, generator)
     with torch.no_grad():
         replayed = use.rollout.replay(call._replace(weights=copies, generator=source), use)
-        pairs = zip((*launched.tensors(), *weights), (*replayed.tensors(), *copies), strict=True)
-        same = all(bool(((a == b) | (a.isnan() & b.isnan())).all()) for a, b in pairs)
-    if same:
+    expected, found = [*launched.tensors(), *weights], [*replayed.tensors(), *copies]
+    ends = [value for value in launched.tensors() if value.requires_grad]
+    # Recomputed once more, a module might change its buffers again.
+    if ends and call.spec.memory == "store":
+        starts = itertools.compress((*worlds.tensors(), *weights), call.grad_flags)
+        bars = [end.detach() for end in ends]
+        expected += torch.autograd.grad(ends, [*starts], bars, True, materialize_grads=True)
+        bars = [value.detach() for value in launched.tensors()]
+        pulled = use.rollout.backward(call.spec.steps, bars, call.grad_flags)
+        found += [gradient for gradient in pulled if gradient is not None]
+    reason = None
+    with torch.no_grad():
+        pairs = zip(expected, found, strict=True)
+        if not all(bool(((a == b) | (a.isnan() & b.isnan())).all()) for a, b in pairs):
+            reason = "a replay gives other numbers than forward, run by Python"
+    if _leaves(ends, (*worlds.tensors(), *weights)).difference(map(id, weights)):
+        reason = "forward reads parameters that are not the rule's, and must have gradients"
+    if reason is None:
         use.rollout.compared.update(call.blocks)
     else:
-        _always_launch(
-            group, "a replay gives other numbers than forward, run by Python", logging.WARNING
-        )
+        _always_launch(group, reason, logging.WARNING)
     return launched
+
+
+def _leaves(ends: Sequence[Tensor], starts: Sequence[Tensor]) -> set[int]:
+    """Return ids of all leaves that get a gradient from `ends`, except through `starts`."""
+    waiting = [end.grad_fn for end in ends]
+    seen: set[Any] = {start.grad_fn for start in starts}
+    leaves: set[int] = set()
+    while waiting:
+        node = waiting.pop()
+        if node is None or node in seen:
+            continue
+        seen.add(node)
+        leaves |= {id(node.variable)} if hasattr(node, "variable") else set()
+        waiting += [following for following, _ in node.next_functions]
+    return leaves
 
 
 class CallGroup:
@@ -243,7 +286,7 @@ def _reserve_capture(group: CallGroup, call: RolloutCall) -> CaptureUse | None:
                     logger.debug("a rollout is launched: captures use all memory that they may")
                     return None
                 # Later calls may be in other modes.
-                with plain_tensors(), torch.autocast("cuda", enabled=False):
+                with plain_tensors(), torch.autocast("cuda", enabled=False), rollout.own_draws():
                     rollout.capture(steps, call)
         except Exception as error:
             group.failed_captures += 1

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import collections
+import contextlib
 import copy
 import itertools
 from collections.abc import Hashable, Sequence
@@ -11,9 +12,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import torch
 from torch import Tensor
 
-from npa_envs.checks import FiniteCheck
 from npa_envs.errors import NPAError
 from npa_envs.ops.custom_op import once_differentiable
+from npa_envs.ops.position_check import PositionCheck
 from npa_envs.rule.rule import NPARule
 from npa_envs.world.cuda_graph import GraphSequence, capture, current_stream, prepare_capture
 from npa_envs.world.particles import Particles, combined
@@ -100,8 +101,6 @@ class CapturedRollout:
         _, _, self._zero_paths, *_ = worlds
         self.bytes = 0
         """Memory of the graphs [bytes]."""
-        self.ready = torch.cuda.Event()  # type: ignore[no-untyped-call]
-        """Event after which the first worlds are complete."""
         self._spec = call.spec
         self._rules = [_clone(rule, x) for rule in call.rules]
         self._custom_rules = [rule for rule in self._rules if not rule.has_network()]
@@ -139,6 +138,10 @@ class CapturedRollout:
         """Return a call's tensors, in the order of the fixed tensors that they are copied to."""
         return [*call.particles.with_zero_paths(self._zero_paths).tensors(), *call.weights]
 
+    def own_draws(self) -> contextlib.AbstractContextManager[object]:
+        """Return a block after which torch's generator of the CPU is as before, for captures."""
+        return torch.random.fork_rng([]) if self._custom_rules else contextlib.nullcontext()
+
     def capture(self, steps: int, call: RolloutCall) -> None:
         """Capture `steps` steps as CUDA graphs; before the first capture, launch a few of them."""
         if not self.graphs:
@@ -158,7 +161,7 @@ class CapturedRollout:
         def backward() -> None:
             gradients[:] = self._pull_back(results, self._cotangents_of(steps))
 
-        draws = None if self._streams is not None else self._generator
+        draws = self._generator if self._draws_per_step else None
         settings, versions = self._settings(), self._versions()
         forward_graph = capture(forward, self.device, pool=self._pool, generator=draws, alone=True)
         # Not every operator that writes to a buffer changes its version.
@@ -278,7 +281,7 @@ class CapturedRollout:
         """Replay a call's graphs; return copies of the worlds. `use` lives until the last pass."""
         generator = call.generator
         inputs = self._inputs_of(call)
-        self.ready.record(current_stream(self.device))
+        check = PositionCheck(call.particles.x.detach())
         results: list[Particles] = []
         for steps in call.blocks:
             if self.differentiable:
@@ -292,8 +295,8 @@ class CapturedRollout:
             else:
                 worlds = Particles(*self.forward(steps, inputs, generator))
             if not results:
-                # Only now, when the device has work: this check takes much CPU time.
-                self._check_positions(call.particles.x, generator, steps)
+                # Only now, when the device has work.
+                self._wait_for(check, generator, steps)
             if self._streams is not None:
                 assert isinstance(generator, WorldRandom)
                 generator.sync_with(self._streams, steps)
@@ -312,10 +315,10 @@ class CapturedRollout:
             return results[-1]
         return combined(torch.cat, results)
 
-    def _check_positions(self, x: Tensor, generator: Randomness | None, steps: int) -> None:
+    def _wait_for(self, check: PositionCheck, generator: Randomness | None, steps: int) -> None:
         """Raise NPAError, with the generator as before the replay, unless positions are finite."""
         try:
-            FiniteCheck(x, self.ready).wait()
+            check.wait()
         except NPAError:
             if self._streams is None:
                 count = steps * self._draws_per_step
@@ -356,7 +359,7 @@ class CapturedRollout:
         if self._streams is not None:
             assert isinstance(generator, WorldRandom)
             self._streams.put(slice(None), generator)
-        else:
+        elif self._draws_per_step:
             source = torch_generator(generator, self.device)
             self._generator.manual_seed(source.initial_seed())
             self._generator.set_offset(reserve_draws(source, steps * self._draws_per_step))

@@ -223,10 +223,13 @@ def rollout(
         keep_every: Return the worlds after every so many steps, a divisor of `steps`: the
             trajectory. Results have one more dimension at the front, of size steps / keep_every.
         cuda_graph: On CUDA, replay repeated calls instead of launching their kernels one by one.
-            That takes a tenth of the CPU time, and results are the same. "auto" captures plain
-            rules, from the third call with the same shapes and options on. True also captures rules
-            with a custom network, whose Python code then no longer runs; False captures nothing:
-            see docs/performance.md.
+            That takes a tenth of the CPU time, and results are the same. "auto" captures from the
+            third call with the same shapes and options on. A network of one's own must then be a
+            function of perception, parameters and buffers, as its Python code no longer runs; it is
+            launched if its first replay gives other numbers. True captures from the second call on,
+            also rules with hooks; False captures nothing: see docs/performance.md. "whole" is
+            "auto", but one kernel runs all steps of many small worlds, with other roundings: see
+            `npa_envs/ops/backend.py`.
         return_path_length: Also return the length of each particle's path.
 
     Returns:

@@ -1,9 +1,10 @@
-"""How a rollout runs: one of several ways, which all have the same results.
+"""How a rollout runs: one of several ways with the same results; one kernel rounds otherwise.
 
 A rollout takes the first way whose condition is met; `run_all_steps` is the last three of them:
 
 | way                      | condition                                      | code                 |
 |--------------------------|------------------------------------------------|----------------------|
+| run all in one kernel    | "whole" on CUDA, no gradients, small worlds    | whole_rollout.py     |
 | skip steps once at rest  | rule with dead zone, no gradients, many steps  | `execute`            |
 | replay CUDA graphs       | CUDA, third call on                            | capture_cache.py     |
 | replay recorded launches | CPU, small worlds, third call on               | replayed_launches.py |
@@ -41,6 +42,7 @@ from npa_envs.world.steps import (
     Step,
     skip_draws,
 )
+from npa_envs.world.whole_rollout import run_whole
 
 Memory = Literal["store", "recompute", "minimal"]
 
@@ -68,8 +70,13 @@ def execute(
 ) -> Particles:
     """Run a checked rollout, and return what `run_all_steps` does.
 
-    Without a watch and path lengths it skips the steps after all worlds have come to rest.
+    Without a watch and path lengths one kernel may run all steps, or it skips the steps after all
+    worlds have come to rest.
     """
+    if watch is None and not with_paths and cuda_graph == "whole":
+        whole = run_whole(spec, rules, particles, generator)
+        if whole is not None:
+            return whole
     if watch is not None or with_paths or not _can_rest(spec, rules, particles.x):
         return run_all_steps(spec, rules, particles, generator, cuda_graph, watch)
     remaining, steps = spec.steps, FIRST_PART[particles.x.device.type]

@@ -14,6 +14,7 @@ from typing import Any
 
 import torch
 from torch import Tensor, nn
+from torch.nn.modules.module import _has_any_global_hook
 
 from npa_envs.rule.rule import HYPER_PARAMETERS, NPARule
 
@@ -25,6 +26,16 @@ HOOKS = ("_forward_hooks", "_forward_pre_hooks", "_backward_hooks", "_backward_p
 
 OF_EVERY_MODULE = frozenset(vars(nn.Module()))
 """Names of the attributes that torch gives every module, which are compared separately."""
+
+
+def is_observed(rule: nn.Module) -> bool:
+    """Return whether hooks or other Python code run with a rule besides its classes' `forward`."""
+    return bool(_has_any_global_hook()) or any(  # type: ignore[no-untyped-call]
+        "forward" in vars(module)
+        or "_orig_mod" in module._modules
+        or any(getattr(module, name) for name in HOOKS)
+        for module in rule.modules()
+    )
 
 
 def rule_tensors(rule: nn.Module, device: torch.device) -> list[Tensor]:
@@ -66,6 +77,11 @@ def _setting(value: Any, device: torch.device, *, in_container: bool = False) ->
         # Values of attributes on the device are read again in each call.
         read_again = value.device == device and not in_container
         return form if read_again else (form, id(value), value._version)
+    if isinstance(value, nn.Module):
+        # It is not a part of the rule, so that its tensors are not read again.
+        tensors = (*value.parameters(), *value.buffers())
+        keys = (_setting(each, device, in_container=True) for each in tensors)
+        return id(value), value.training, *keys
     if isinstance(value, list | tuple):
         return type(value), tuple(_setting(entry, device, in_container=True) for entry in value)
     if isinstance(value, dict):

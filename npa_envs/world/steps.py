@@ -14,6 +14,7 @@ from torch import Tensor
 from npa_envs.checks import constant
 from npa_envs.ops.perceive import Rows, perceive_rows, updates_in_parts
 from npa_envs.ops.physics import Physics
+from npa_envs.ops.random_numbers import mask_increment, torch_masks
 from npa_envs.ops.species_density import perceive_by_species
 from npa_envs.ops.static_worlds import StaticRows, prepare_static, static_rows
 from npa_envs.ops.update import bounded, update_particles
@@ -96,6 +97,36 @@ def draw_step(x: Tensor, physics: Physics, generator: Randomness | None) -> Draw
         noise = normal_draws(generator, x.shape, x)
         noise *= physics.position_noise
     return Draws(mask, noise)
+
+
+def draw_ahead(
+    x: Tensor, physics: Physics, steps: int, generator: Randomness | None
+) -> list[Tensor | None]:
+    """Return the masks [T, B, N] and the noise [T, B, N, D] of `steps` calls of `draw_step`.
+
+    A `WorldRandom` is `take_steps` of the caller's, and draws all steps at once.
+    """
+    world_count, particle_count, _ = x.shape
+    if isinstance(generator, WorldRandom):
+        # Only the shape is read.
+        drawn = [draw_step(x[:1].expand(steps * world_count, -1, -1), physics, generator)]
+    else:
+        masked = physics.update_prob < 1.0 and physics.position_noise == 0.0
+        if masked and not torch.cuda.is_current_stream_capturing():
+            increment = mask_increment(x.device, world_count * particle_count)
+            if increment is not None:
+                source = torch_generator(generator, x.device)
+                begin = reserve_draws(source, steps * increment)
+                masks = torch.empty(steps, *x.shape[:2], dtype=torch.uint8, device=x.device)
+                seed = source.initial_seed()
+                torch_masks(masks.view(steps, -1), physics.update_prob, seed, begin)
+                return [masks, None]
+        drawn = [draw_step(x, physics, generator) for _ in range(steps)]
+    fields = [[value for value in each if value is not None] for each in zip(*drawn, strict=True)]
+    return [
+        torch.cat(values).view(steps, world_count, *values[0].shape[1:]) if values else None
+        for values in fields[:2]
+    ]
 
 
 def skip_draws(x: Tensor, physics: Physics, steps: int, generator: Randomness | None) -> None:

@@ -135,7 +135,7 @@ def test_list_names_tasks_presets_targets_and_losses(capsys):
     assert main(["list"]) == 0
     text = capsys.readouterr().out
     words = ["morphogenesis2d", "paper", "fast", "tiny", "gecko", "butterfly", "texture:"]
-    words += ["vgg_ot", "filter_swd", "npa/Regeneration2D-v0", "npa/Mixing-v0"]
+    words += ["vgg_ot", "joint_swd", "npa/Regeneration2D-v0", "npa/Mixing-v0"]
     words += ["npa/InvasionLarge-v0", "morphogenesis3d: doughnut, duck, mushroom, rocket"]
     words += ["bubbles, cells, dots, droplets, grid, hearts, maze, stars"]
     assert [word for word in words if word not in text] == []

@@ -61,7 +61,7 @@ OF_ONE = {
     ],
     functools.partial(make, "npa/Texture-v0"): [
         ({"boundary": "open"}, "boundary must be 'periodic' for textures"),
-        ({"loss": "swd"}, "did you mean 'patch_swd'|known: filter_swd"),
+        ({"loss": "swd"}, "known: joint_swd, patch_ot, patch_swd"),
     ],
     functools.partial(make, POINTS): [
         ({"boundary": "periodic"}, "boundary must be 'open' for"),

@@ -1,5 +1,6 @@
 // The threads of a CUDA block on a CPU, in turn from one meeting to the next: what CUDA C++ needs
-// to run without a GPU. It shows what such code computes, not its races.
+// to run without a GPU. It shows what such code computes. Results that differ when threads take turns
+// `backwards` show a race.
 
 #pragma once
 
@@ -40,6 +41,7 @@ inline jmp_buf outside, inside[MOST];
 inline State state[MOST];
 inline unsigned long long values[MOST];
 inline std::function<void()> body;
+inline bool backwards = false;  // The last thread, and the last warp, comes first.
 
 inline void meet(State next = RUNS)
 {
@@ -65,8 +67,8 @@ inline void go_on(unsigned thread, bool begins)
 // Let all threads of a warp go on; return whether they have ended.
 inline bool go_on_together(unsigned first, bool begins)
 {
+    for (unsigned lane = 0; lane < WARP; ++lane) go_on(first + (backwards ? 31 - lane : lane), begins);
     for (unsigned thread = first; thread < first + WARP; ++thread) {
-        go_on(thread, begins);
         if (state[thread] != state[first]) {
             std::puts("the threads of a warp went different ways");
             std::exit(1);
@@ -92,7 +94,8 @@ inline void run(unsigned threads, std::function<void()> function)
     bool begins = true;
     for (unsigned left = threads; left > 0; begins = false) {
         bool all_wait = true;
-        for (unsigned first = 0; first < threads; first += WARP) {
+        for (unsigned warp = 0; warp < threads; warp += WARP) {
+            const unsigned first = backwards ? threads - WARP - warp : warp;
             if (state[first] != RUNS) continue;
             all_wait = false;
             if (go_on_together(first, begins)) left -= WARP;
@@ -152,6 +155,7 @@ inline unsigned __ballot_sync(unsigned, bool condition)
 }
 inline int __popc(unsigned bits) { return std::popcount(bits); }
 inline int __clz(unsigned bits) { return std::countl_zero(bits); }
+inline int __ffsll(unsigned long long bits) { return bits ? std::popcount(bits ^ (bits - 1)) : 0; }
 inline int __ffs(unsigned bits) { return bits ? std::popcount(bits ^ (bits - 1)) : 0; }
 inline unsigned __funnelshift_l(unsigned low, unsigned high, unsigned shift)
 {

@@ -27,11 +27,13 @@ from npa_envs.kernels.cuda.sort import (
     sort_small_splats,
     sort_small_worlds,
 )
+from npa_envs.kernels.cuda.whole_rollout import WorldVariant, whole_rollout
 from npa_envs.kernels.pictures.blending import block_kernels
 from npa_envs.kernels.pictures.pixel_errors import gather_errors
 from npa_envs.kernels.portable.brush_sums import brush_kernel
 from npa_envs.kernels.portable.random_numbers import mix_keys
 from npa_envs.kernels.portable.rewards_and_ends import update_episodes
+from npa_envs.kernels.portable.update import report_finite
 from npa_envs.ops import warmup
 from npa_envs.ops.launch import launch, loaded_modules
 from npa_envs.runtime import start_warp
@@ -61,9 +63,11 @@ VARIANTS = {
     "vectors 3D": lambda: row_kernels(3, 32, 17, 8, False).read_rows,
     "sums of vectors": mixing_sum,
     "sums under brushes": lambda: brush_kernel(wp.float32, 3, True),
+    "reports": lambda: report_finite(wp.float32),
     "keys": lambda: mix_keys,
     "steering": lambda: steering_kernels(2, 8, True).steer,
     "steering 3D": lambda: steering_kernels(3, 8, False).steer,
+    "whole rollouts": lambda: whole_rollout(WorldVariant(128, 4, 1, 4, 1)),
     "pictures": lambda: block_kernels(wp.float32).pull_back_blocks,
     "errors of pictures": lambda: gather_errors(wp.float64),
     "errors in float32": lambda: gather_errors(wp.float32),
@@ -100,6 +104,11 @@ def compile_for(module, capability, folder):
 def test_a_kernel_compiles_with_all_native_code_for_the_oldest_and_the_newest(capability, tmp_path):
     compile_for(update_episodes.module, capability, tmp_path)
     assert list(tmp_path.glob(f"*.sm{capability}.cubin"))
+
+
+def test_worlds_of_two_blocks_compile_where_there_are_clusters(tmp_path):
+    compile_for(whole_rollout(WorldVariant(512, 8, 2, 1, 2)).module, 90, tmp_path)
+    assert list(tmp_path.glob("*.sm90.cubin"))
 
 
 @pytest.mark.slow

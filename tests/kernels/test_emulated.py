@@ -10,8 +10,11 @@ import pytest
 import torch
 from support.worlds import relative_error
 
+import npa_envs
+from npa_envs import reference
 from npa_envs.kernels import native_functions as native
 from npa_envs.kernels.cuda import equivariance as cuda
+from npa_envs.kernels.cuda.whole_rollout import world_size
 from npa_envs.ops.equivariance import VectorSizes, read_rows, steer_rows
 
 HERE = Path(__file__).parent
@@ -28,12 +31,12 @@ def function_of(text, name):
     return re.search(head + r"(?:\{[^\n]*\}\n|\{\n.*?\n\}\n)", text, re.S)[0]
 
 
-def printed_by(source, folder, includes):
+def printed_by(source, folder, includes, optimise="-O1"):
     """Return what a C++ program prints; it is compiled and runs in `folder`."""
     compiler = shutil.which("g++")
     if compiler is None:
         pytest.skip("needs g++")
-    options = ["-std=c++20", "-O1", "-w", *(f"-I{path}" for path in (HERE, folder, includes))]
+    options = ["-std=c++20", optimise, "-w", *(f"-I{path}" for path in (HERE, folder, includes))]
     command = [compiler, *options, "-o", "program", str(HERE / source)]
     subprocess.run(command, cwd=folder, check=True)
     program = [str(folder / "program")]
@@ -126,3 +129,86 @@ def test_vectors_of_rows_are_what_the_portable_kernels_make_of_them(form, count,
     values = torch.from_numpy(np.fromfile(tmp_path / "out", np.float32))
     for value, answer in zip(values.split([a.numel() for a in expected]), expected, strict=True):
         assert relative_error(value.view(answer.shape), answer) < 1e-6
+
+
+def without(text, *names):
+    """The C++ text without the definitions of some functions, which the test replaces."""
+    for name in names:
+        text = text.replace(function_of(text, name), "")
+    return text
+
+
+def rounded_exactly(text):
+    """The C++ text with inverses and inverse roots in place of their approximations."""
+    for word, inverse in (("rsqrt", "1.0f / sqrtf"), ("rcp", "1.0f / ")):
+        call = rf'asm\("{word}\.approx\.ftz\.f32 %0, %1;" : "=f"\((\w+)\) : "f"\((.*?)\)\);'
+        text = re.sub(call, rf"\1 = {inverse}(\2);", text)
+    return text
+
+
+def exact_rollout(x, s, rule, masks, noise, side):
+    """The rollout in float64, by the reference; `side`: of a box with walls, or None."""
+    weights = rule.hidden.weight, rule.hidden.bias, rule.output.weight
+    hidden, bias, output, x, s = (value.detach().double() for value in (*weights, x, s))
+    for mask, moved in zip(masks, noise, strict=True):
+        z = reference.perceive(x, s, rule.eps0, rule.eps0, moment_inverse=rule.moment_inverse)
+        update = torch.relu(z @ hidden.T + bias) @ output.T * mask[..., None]
+        delta = update[..., :2]
+        step = rule.alpha * rule.eps0 / (1.0 + delta.norm(dim=-1, keepdim=True))
+        x, s = x + moved + step * delta, s + update[..., 2:]
+        x = x if side is None else reference.reflected(x, (side, side))
+    return x, s
+
+
+@pytest.mark.parametrize(
+    ("particles", "channels", "warps", "groups", "moment_inverse", "side"),
+    [
+        pytest.param(60, 16, 1, 3, "threshold", None, marks=pytest.mark.slow),
+        pytest.param(100, 5, 2, 1, "smooth", None, marks=pytest.mark.slow),
+        (200, 16, 4, 1, "threshold", 0.3),
+        pytest.param(128, 16, 8, 1, "threshold", None, marks=pytest.mark.slow),
+        pytest.param(400, 8, 8, 1, "threshold", None, marks=pytest.mark.slow),
+    ],
+)
+def test_whole_rollouts_are_those_of_the_reference(
+    particles, channels, warps, groups, moment_inverse, side, tmp_path
+):
+    worlds, steps, eps = 4 if groups > 1 else 1, 3, 0.1
+    torch.manual_seed(0)
+    rule = npa_envs.NPARule(2, channels, 40, eps0=eps, moment_inverse=moment_inverse)
+    for parameter in rule.parameters():
+        torch.nn.init.normal_(parameter, std=0.2)
+    x = (torch.rand(worlds, particles, 2) - 0.5) * (1.4 * (particles / 4096) ** 0.5)
+    s, masks = torch.randn(worlds, particles, channels), torch.rand(steps, worlds, particles) < 0.5
+    noise = 0.01 * torch.randn(steps, *x.shape)
+    weights = rule.hidden.weight, rule.hidden.bias, rule.output.weight
+    floats = torch.cat([value.detach().flatten() for value in (*weights, x, s, noise)])
+    (tmp_path / "in").write_bytes(floats.numpy().tobytes() + masks.numpy().tobytes())
+    scales = 7.5 / eps, 30.0 / np.pi / eps**3 / particles, side or 1.0, side or 1.0
+    inverse, walls = 1 + (moment_inverse == "smooth"), int(side is not None)
+    sizes = {
+        "WORLDS": worlds, "COUNT": particles, "CHANNELS": channels, "HIDDEN": 40,
+        "WIDTH": rule.perception_dim, "STEPS": steps, "SIZE": world_size(particles),
+        "WARPS": warps, "GROUPS": groups,
+        "NUMBERS": ", ".join(f"{value}f" for value in (1.0 / eps, 0.5 * eps, 1.0, *scales)),
+        "CHOICES": f"{steps}, 2, {inverse}, {walls}, {2 * channels}, {4 * channels}",
+    }  # fmt: skip
+    defined = "".join(f"#define {name} {value}\n" for name, value in sizes.items())
+    (tmp_path / "sizes.h").write_text(defined, encoding="utf-8")
+    named = {
+        "mathematics.cuh": ("falloff_within", "log_above_one", "log_scale_of_square"),
+        "cuda/network.cuh": ("scale_exponent", "scale_to"),
+    }
+    needed = [function_of(text_of(file), name) for file in named for name in named[file]]
+    needed.insert(1, function_of(text_of("mathematics.cuh"), "smoothing"))
+    replaced = "multiply_half8", "load_transposed", "rsqrt_fast", "sync_threads"
+    rollouts = without(text_of("cuda/whole_rollout.cuh"), *replaced)
+    head = "namespace npa {\n" + rounded_exactly("\n".join(needed)) + "}\n"
+    (tmp_path / "native.h").write_text(head + rollouts, encoding="utf-8")
+    printed_by("worlds_on_cpu.cpp", tmp_path, KERNELS, "-O0")
+
+    values = torch.from_numpy(np.fromfile(tmp_path / "out", np.float32))
+    new_x, new_s = values.split([x.numel(), s.numel()])
+    exact_x, exact_s = exact_rollout(x, s, rule, masks, noise, side)
+    assert relative_error(new_x.view_as(x) - x, exact_x - x.double()) < 1e-5
+    assert relative_error(new_s.view_as(s) - s, exact_s - s.double()) < 1e-5

@@ -5,6 +5,7 @@ import math
 import sys
 
 import pytest
+import skips
 import torch
 from drift import DriftRow
 
@@ -87,7 +88,7 @@ def test_what_does_not_fit_into_memory_or_the_time_is_left_out():
 
 def test_each_skip_is_measured_with_and_without():
     here = session()
-    rows = suites.skip_rows(here)
+    rows = skips.skip_rows(here)
     assert here.left_out == {}
     assert len({row.condition for row in rows}) == len(rows) == 10
     assert all(row.done_us.median > 0 and row.skipped_us.median > 0 for row in rows)
@@ -106,7 +107,7 @@ def test_kernels_are_cudas(device):
 
 def test_one_species_is_compared_with_the_rollout_that_it_is():
     here = session()
-    rows = suites.SUITES["species"](here)["one_species"]
+    rows = skips.one_species_rows(here)
     assert [(row.left_out, row.condition) for row in rows] == [
         ("species, 2D (1, 256, 2)", f"{what}, eager") for what in ("inference", "training")
     ]
@@ -118,7 +119,7 @@ def test_one_species_is_compared_with_the_rollout_that_it_is():
 
 def test_a_report_is_json_without_numbers_that_json_has_not():
     row = DriftRow("tiny", 1e-6, math.nan, 1e-6, 1e-6, 1e-6)
-    skip = suites.SkipRow("a", "b", Timing(3.0, 3.0, 3.0), Timing(3.0, 3.0, 3.0), "0%")
+    skip = skips.SkipRow("a", "b", Timing(3.0, 3.0, 3.0), Timing(3.0, 3.0, 3.0), "0%")
     tables = {"drift": [row], "skips": [skip]}
     report = suites.BenchReport("quick", "npa-envs bench", "abc", 1, session(), tables)
     loaded = json.loads(report.json())

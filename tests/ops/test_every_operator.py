@@ -20,7 +20,7 @@ from npa_envs import reference
 from npa_envs.ops import launch, orbit, render_gaussians, splat
 from npa_envs.ops.cpu_threads import RANGES_PER_THREAD, even_ranges, run_together
 from npa_envs.ops.perceive import NeighbourState
-from npa_envs.ops.physics import Limits, Physics
+from npa_envs.ops.physics import Limits, Physics, make_physics
 from npa_envs.ops.pictures.splat import picture_losses
 from npa_envs.ops.update import ActedWorlds, PreparedActions
 
@@ -123,7 +123,12 @@ def test_tensors_that_wrap_others_have_the_results_of_each_or_are_rejected(wrapp
     found = npa_envs.perceive(*pairs, 0.3)
     expected = [npa_envs.perceive(*worlds, 0.3) for worlds in ((x, s), others)]
     assert_same((found.a, found.b), expected)
-    refused(r"memory of their own, got .*TwoTensor", npa_envs.perception_fields, *pairs, 0.3)
+    fields = npa_envs.perception_fields(*pairs, 0.3)
+    expected = [npa_envs.perception_fields(*worlds, 0.3) for worlds in ((x, s), others)]
+    for field, own, other in zip(fields, *expected, strict=True):
+        assert_same((field.a, field.b), (own, other))
+    physics = make_physics(3, 5, torch.float32, eps=0.3)
+    refused(r"memory of their own, got .*TwoTensor", NeighbourState, *pairs, physics)
     nested = torch.nested.nested_tensor([x[0], x[0, :9]])
     refused("x must be one dense tensor, got a nested one", npa_envs.perceive, nested, s, 0.3)
 

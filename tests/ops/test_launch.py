@@ -1,7 +1,16 @@
 """Launches: tensors of any strides and sizes, one after the other, are described as they are."""
 
-import torch
+import collections
+from concurrent.futures import ThreadPoolExecutor
 
+import pytest
+import torch
+from support.refusals import refused
+from support.worlds import assert_same, random_world
+
+import npa_envs
+from npa_envs.ops import launch, position_check
+from npa_envs.ops.perceive import _perceive
 from npa_envs.ops.random_numbers import draw
 
 WORLDS = 12
@@ -28,3 +37,119 @@ def test_tensors_with_and_without_strides_take_turns(device):
     for chosen in SELECTIONS * 2:
         results = drawn(keys[chosen], episodes[chosen], episodes[chosen].contiguous())
         assert torch.equal(results, expected[chosen])
+
+
+def calls_of(function):
+    """Return this thread's calls of an operator, numbers or launches, one for each kind."""
+    return [calls for key, calls in launch._thread.calls.items() if key[0] is function]
+
+
+def perceived(x, s, **options):
+    """Return perception, its gradients and all fields."""
+    x, s = x.detach().requires_grad_(), s.detach().requires_grad_()
+    z = npa_envs.perceive(x, s, 0.3, **options)
+    bars = torch.autograd.grad(z.sin().sum(), [x, s], allow_unused=True, materialize_grads=True)
+    with torch.no_grad():
+        quiet = npa_envs.perceive(x, s, 0.3, **options)
+    assert torch.equal(quiet, z)
+    return [z.detach(), *bars, *npa_envs.perception_fields(x, s, 0.3)]
+
+
+@pytest.fixture
+def nothing_repeated():
+    launch._thread.calls.clear()
+
+
+@pytest.mark.usefixtures("nothing_repeated")
+@pytest.mark.parametrize("options", [{}, {"detach_positions": False}, {"box": 2.0}], ids=str)
+def test_repeated_launches_have_the_results_of_the_first(
+    options, device, dtype, space_dim, monkeypatch
+):
+    """Sizes and places in memory take turns, and no result is written to again."""
+    kept, repeats, run = [], set(), launch._Repeat.run
+    monkeypatch.setattr(
+        launch._Repeat, "run", lambda each, inputs: repeats.add(each) or run(each, inputs)
+    )
+    for call in range(7):
+        for particles in (31, 40):
+            x, s = random_world(2, particles, space_dim, 5, dtype=dtype, device=device, seed=call)
+            if call == 4:
+                # Begins anywhere in memory.
+                s = torch.cat([s.new_zeros(1), s.flatten()])[1:].view_as(s)
+            if call == 5:
+                s = s.mT.contiguous().mT
+            found = perceived(x, s, **options)
+            launch._thread.calls, before = collections.OrderedDict(), launch._thread.calls
+            first = perceived(x, s, **options)
+            launch._thread.calls = before
+            assert_same(found, first)
+            kept.append((found, first))
+    for found, first in kept:
+        assert_same(found, first)
+    # With and without gradients, backward and fields, of two sizes; threads have their own.
+    assert len(repeats) >= 8
+
+
+@pytest.mark.usefixtures("nothing_repeated")
+def test_calls_with_other_operators_of_torch_are_never_repeated(device):
+    """Large worlds are sorted with the help of torch's sums."""
+    x, s = random_world(1, 4200, 2, 5, dtype=torch.float32, device=device)
+    results = [npa_envs.perceive(x, s, 0.1) for _ in range(5)]
+    assert all(torch.equal(result, results[0]) for result in results)
+    assert calls_of(_perceive._function) == [5]
+
+
+@pytest.mark.usefixtures("nothing_repeated")
+def test_arguments_that_share_memory_are_told_apart_later(device):
+    whole = torch.zeros(4, dtype=torch.int64, device=device)
+
+    def drawn(first, second):
+        return draw(first, second, second, 0, "uniform", 5, torch.float32, 0)
+
+    steps = torch.arange(4, dtype=torch.int32, device=device)
+    for _ in range(4):
+        drawn(whole, steps)
+    other = steps + 1
+    expected = draw(whole, steps, other.clone(), 0, "uniform", 5, torch.float32, 0)
+    assert not torch.equal(drawn(whole, steps), expected)
+    assert torch.equal(draw(whole, steps, other, 0, "uniform", 5, torch.float32, 0), expected)
+
+
+@pytest.mark.usefixtures("nothing_repeated")
+def test_threads_and_modes_repeat_on_their_own(device):
+    x, s = random_world(2, 31, 3, 5, dtype=torch.float32, device=device)
+    expected = perceived(x, s)
+
+    def work():
+        for mode in (torch.no_grad, torch.inference_mode, torch.enable_grad):
+            for _ in range(4):
+                with mode():
+                    found = npa_envs.perceive(x, s, 0.3)
+                assert torch.equal(found, expected[0])
+
+    with ThreadPoolExecutor(3) as pool:
+        for done in [pool.submit(work) for _ in range(3)]:
+            done.result()
+
+
+@pytest.mark.parametrize("fast", [False, True])
+@pytest.mark.parametrize("size", [7, 60, 4000, 140_000])
+def test_positions_that_are_not_finite_are_refused_by_all_checks(size, fast, device, monkeypatch):
+    if fast:
+        # On a CPU as well, threads report.
+        monkeypatch.setattr(position_check, "_is_slow", lambda x: False)
+    x, s = random_world(1, size, 2, 1, dtype=torch.float32, device=device)
+    # Beside a multiple of what a thread reads at once.
+    for k in {0, size // 3, size - 1}:
+        for _ in range(4):
+            npa_envs.perception_fields(x, s, 1e-3)
+        broken = x.clone()
+        broken[0, k, 1] = torch.inf
+        refused(
+            rf"x must be finite, got .* world 0, particle {k} \(1 ",
+            npa_envs.perceive,
+            broken,
+            s,
+            1e-3,
+        )
+        refused("x must be finite", npa_envs.perception_fields, broken[:, k : k + 1], s[:, :1], 1)

@@ -372,3 +372,11 @@ def test_density_of_thousands_of_neighbours_counts_each_once(device):
     alone = npa_envs.perception_fields(x[:, :1], s[:, :1], 0.2).rho
     together = npa_envs.perception_fields(x, s, 0.2).rho
     torch.testing.assert_close(together, 9000 * alone.expand_as(together), rtol=1e-12, atol=0.0)
+
+
+def test_a_backward_pass_refuses_perception_that_was_changed(device):
+    x, s = random_world(1, 20, 2, 5, dtype=torch.float64, device=device)
+    z = npa_envs.perceive(x, s.requires_grad_(), 0.3)
+    z.zero_()
+    with pytest.raises(RuntimeError, match="modified by an inplace operation"):
+        z.sum().backward()

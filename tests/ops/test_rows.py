@@ -13,7 +13,7 @@ from support.worlds import (
 
 import npa_envs
 from npa_envs.errors import NPAError
-from npa_envs.ops import backend, perception_passes
+from npa_envs.ops import backend, launch, perception_passes
 from npa_envs.ops.physics import Terms
 
 # The worst errors measured were 1.2e-6 (CUDA), and in a box of two eps 2.1e-6 (CUDA).
@@ -58,6 +58,8 @@ def shared(request, monkeypatch):
     """Set the maximum number of particles of worlds in which several threads share a particle."""
     monkeypatch.setattr(backend, "SHARED_WORLD", request.param)
     backend.choose.cache_clear()
+    # Repeated launches would be those of the other choice.
+    launch._thread.calls.clear()
     yield request.param
     backend.choose.cache_clear()
 

@@ -115,8 +115,7 @@ def test_commands_in_blocks_of_shell_have_the_options_that_they_are_given(capsys
     assert set(re.findall(r"npa-envs bench .*?--suite (\w+)", texts)) <= set(SUITES)
     used: dict[tuple[str, ...], set[str]] = {}
     for line in re.sub(r"\\\n", " ", "\n".join(blocks)).replace(" && ", "\n").splitlines():
-        # What follows `--` is for the runs of a sweep.
-        words = re.sub(r"#.*| > .*| -- .*", "", line).replace(".venv/bin/", "").split()
+        words = re.sub(r"#.*| > .*", "", line).replace(".venv/bin/", "").split()
         if words[:1] == ["npa-envs"] and words[1:2] and words[1][0] != "-" and "TASK" not in words:
             command = tuple(words[1:3]) if words[1] == "train" else (words[1],)
             options = {word.partition("=")[0] for word in words if word.startswith("-")}

@@ -20,7 +20,6 @@ NAMES = [name for name in TASKS if name != JOINT_TASK_NAME]
 VARIANTS = [
     ("morphogenesis2d", {}),
     ("texture", {"loss": "patch_swd"}),
-    ("texture", {"loss": "filter_swd"}),
     ("morphogenesis3d", {"ssim_weight": 0.2}),
 ]
 """Tasks whose losses are worth a graph each."""
@@ -258,9 +257,9 @@ def test_what_is_missing_is_named_before_anything_is_written(
 
 COMMANDS = {
     "texture": (
-        ["--loss", "filter_swd"],
+        ["--loss", "patch_ot"],
         ["--particle-count", "200", "--target", "grid", "--resolution", "32"],
-        "loss: filter_swd",
+        "loss: patch_ot",
         ["growth.gif"],
     ),
     "morphogenesis3d": (

@@ -4,17 +4,18 @@ import functools
 
 import pytest
 import torch
-from test_captured_rollouts import DEVICE, EPS, is_captured, same, worlds
+from test_captured_rollouts import DEVICE, EPS, is_captured, run, same, worlds
 from test_captured_rollouts import as_launched as follows
 from torch import nn
 
 import npa_envs
-from npa_envs.world.rule_settings import rule_settings
+from npa_envs.world.capture_cache import _leaves
+from npa_envs.world.rule_settings import is_observed, rule_settings
 
 pytestmark = pytest.mark.usefixtures("nothing_captured")
 
 CPU = torch.device("cpu")
-as_launched = functools.partial(follows, calls=3, cuda_graph=True)
+as_launched = functools.partial(follows, calls=4)
 
 
 class Scaled(npa_envs.NPARule):
@@ -26,6 +27,7 @@ class Scaled(npa_envs.NPARule):
         self.factor = torch.ones(1)
         self.number = 2.0
         self.listed = [1, {"word": None}]
+        self.aside = [nn.Linear(1, 1)]
 
     def forward(self, perception):
         return self.number * self.factor * super().forward(perception) + self.shift
@@ -88,7 +90,16 @@ CHANGES = {
     "a dictionary in a list": lambda rule: rule.listed[1].update(word=1),
     "a hook": lambda rule: rule.hidden.register_forward_hook(lambda _, __, output: 2.0 * output),
     "a mode": lambda rule: rule.eval(),
+    "a tensor of a module aside": lambda rule: nn.init.ones_(rule.aside[0].weight),
     "a module": lambda rule: setattr(rule, "output", nn.Linear(32, 10)),
+}
+
+
+OBSERVERS = {
+    "a hook": lambda rule: rule.hidden.register_forward_hook(lambda *_: None),
+    "a backward hook": lambda rule: rule.register_full_backward_hook(lambda *_: None),
+    "a forward of the object": lambda rule: setattr(rule, "forward", lambda z: z),
+    "a compiled layer": lambda rule: setattr(rule, "hidden", torch.compile(rule.hidden)),
 }
 
 
@@ -104,6 +115,23 @@ def test_what_a_network_depends_on_is_seen(change):
     assert rule_settings(rule, CPU) == before
     CHANGES[change](rule)
     assert rule_settings(rule, CPU) != before
+
+
+@pytest.mark.parametrize("observe", OBSERVERS)
+def test_rules_that_more_runs_with_than_forward_are_known(observe):
+    rule = Scaled(2, 8, 32, eps0=EPS)
+    assert not is_observed(rule)
+    OBSERVERS[observe](rule)
+    assert is_observed(rule)
+
+
+def test_leaves_are_those_beyond_the_starts():
+    first, second, third = (torch.ones(2, requires_grad=True) for _ in range(3))
+    start = first * 2.0
+    end = (start * second).sum() + (third * start.detach()).sum()
+    assert _leaves([end], [start]) == {id(second), id(third)}
+    assert _leaves([end], []) == {id(first), id(second), id(third)}
+    assert _leaves([first.detach()], []) == set()
 
 
 @pytest.mark.gpu
@@ -217,6 +245,87 @@ def test_a_rule_that_counts_its_calls_is_launched(kind, caplog):
         # What captures it calls it too, so that its count differs, and is not held.
         assert not torch.equal(seen[1][-1], seen[1][-3])
         assert "a replay gives other numbers" in caplog.text
+
+
+@pytest.mark.gpu
+def test_hooks_run_in_every_call_unless_a_capture_is_asked_for():
+    rule, seen = of_type(Scaled), []
+    rule.output.register_forward_hook(lambda *_: seen.append(1))
+    as_launched(rule)
+    assert len(seen) == 8 * 7
+    assert not is_captured()
+    as_launched(rule, cuda_graph=True)
+    assert is_captured()
+
+
+class Steered(npa_envs.NPARule):
+    """Its gradients depend on what nobody sees, and it may read another module."""
+
+    factor, other, waits = 1.0, None, False
+
+    def forward(self, perception):
+        if Steered.waits and float(perception.sum()) == 0.5:
+            return perception
+        other = 0.0 if Steered.other is None else Steered.other.bias
+        return Turned.apply(super().forward(perception)) + other
+
+
+class Turned(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, values):
+        return 1.0 * values
+
+    @staticmethod
+    def backward(ctx, bar):
+        Steered.factor += 1.0
+        return Steered.factor * bar
+
+
+@pytest.mark.gpu
+def test_other_gradients_are_found_too(caplog):
+    Steered.factor = 1.0
+    run(of_type(Steered), *worlds(), cuda_graph=False)
+    rule = of_type(Steered)
+    for _ in range(4):
+        run(rule, *worlds())
+    assert "a replay gives other numbers" in caplog.text
+    assert not is_captured()
+
+
+@pytest.mark.gpu
+def test_parameters_of_others_keep_their_gradients(caplog, monkeypatch):
+    monkeypatch.setattr(Turned, "backward", staticmethod(lambda ctx, bar: bar))
+    monkeypatch.setattr(Steered, "other", nn.Linear(3, 10, device=DEVICE))
+    rule, bias = of_type(Steered), Steered.other.bias
+    gradients = []
+    for _ in range(5):
+        bias.grad = None
+        generator = torch.Generator(DEVICE).manual_seed(0)
+        npa_envs.rollout(rule, *worlds(), 4, generator=generator)[1].sum().backward()
+        gradients.append(bias.grad)
+    assert all(torch.equal(gradient, gradients[0]) for gradient in gradients)
+    assert float(gradients[0].abs().max()) > 0.0
+    assert "parameters that are not the rule's" in caplog.text
+
+
+@pytest.mark.gpu
+def test_a_rule_that_waits_for_the_device_is_launched(monkeypatch):
+    monkeypatch.setattr(Turned, "backward", staticmethod(lambda ctx, bar: bar))
+    monkeypatch.setattr(Steered, "waits", True)
+    as_launched(of_type(Steered))
+    assert not is_captured()
+    as_launched(of_type(Scaled))
+    assert is_captured()
+
+
+@pytest.mark.gpu
+def test_frozen_layers_are_followed():
+    rule = of_type(Scaled)
+    as_launched(rule)
+    rule.hidden.requires_grad_(False)
+    as_launched(rule)
+    rule.hidden.requires_grad_(True)
+    as_launched(rule, 1)
 
 
 @pytest.mark.gpu

@@ -25,9 +25,17 @@ def worlds(count=3, particles=60, space_dim=2, seed=0, dtype=torch.float32):
     return random_world(count, particles, space_dim, 8, dtype=dtype, device=DEVICE, seed=seed)
 
 
-def make_rule(space_dim=2, dtype=torch.float32, seed=0, **options):
+class Doubled(npa_envs.NPARule):
+    runs = 0
+
+    def forward(self, perception):
+        Doubled.runs += 1
+        return 2.0 * super().forward(perception)
+
+
+def make_rule(space_dim=2, dtype=torch.float32, seed=0, kind=npa_envs.NPARule, **options):
     torch.manual_seed(seed)
-    rule = npa_envs.NPARule(space_dim, 8, 32, eps0=EPS, **options)
+    rule = kind(space_dim, 8, 32, eps0=EPS, **options)
     for parameter in rule.parameters():
         torch.nn.init.normal_(parameter, std=0.1)
     return rule.to(DEVICE, dtype)
@@ -45,7 +53,8 @@ def run(rule, x, s, steps=7, *, seed=0, gradients=True, by_world=False, **option
     result = list(results)
     if gradients:
         loss = sum(value.sin().sum() for value in results)
-        result += torch.autograd.grad(loss, [x, s, *rule.parameters()], allow_unused=True)
+        weights = [weight for weight in rule.parameters() if weight.requires_grad]
+        result += torch.autograd.grad(loss, [x, s, *weights], allow_unused=True)
     drawn = generator.uniform(3) if by_world else torch.rand(3, device=DEVICE, generator=generator)
     return [*result, drawn]
 
@@ -134,8 +143,9 @@ def test_the_global_generator_goes_on_as_launched():
     assert not torch.equal(seen[0][0], seen[0][3])
 
 
-def test_weights_are_read_anew_and_results_are_kept():
-    rule = make_rule()
+@pytest.mark.parametrize("kind", [npa_envs.NPARule, Doubled])
+def test_weights_are_read_anew_and_results_are_kept(kind):
+    rule = make_rule(kind=kind)
     x, s = worlds()
     kept = []
     for call in range(6):
@@ -146,7 +156,7 @@ def test_weights_are_read_anew_and_results_are_kept():
         with torch.no_grad():
             for parameter in rule.parameters():
                 parameter.mul_(1.01)
-        if call == 3:
+        if call == 3 and kind is npa_envs.NPARule:
             rule = make_rule(seed=5)
         if call == 4:
             rule = rule.cpu().to(DEVICE)
@@ -251,23 +261,16 @@ def test_positions_that_are_not_finite_are_refused_and_nothing_is_drawn():
     as_launched(rule, 1, gradients=False)
 
 
-class Doubled(npa_envs.NPARule):
-    runs = 0
-
-    def forward(self, perception):
-        Doubled.runs += 1
-        return 2.0 * super().forward(perception)
-
-
-def test_rules_with_a_network_of_their_own_are_captured_where_asked():
+@pytest.mark.parametrize(("cuda_graph", "launched"), [("auto", 2), (True, 1)])
+def test_rules_with_a_network_of_their_own_are_captured(cuda_graph, launched):
     torch.manual_seed(0)
     rule = Doubled(2, 8, 32, eps0=EPS).to(DEVICE)
-    as_launched(rule)
+    as_launched(rule, launched, cuda_graph)
     assert not is_captured()
-    as_launched(rule, cuda_graph=True)
+    as_launched(rule, 3, cuda_graph)
     assert is_captured()
     before = Doubled.runs
-    run(rule, *worlds(), cuda_graph=True)
+    run(rule, *worlds(), cuda_graph=cuda_graph)
     assert Doubled.runs == before
 
 
@@ -287,8 +290,9 @@ def test_species_are_captured():
     assert is_captured()
 
 
-def test_streams_and_threads():
-    rule = make_rule()
+@pytest.mark.parametrize("kind", [npa_envs.NPARule, Doubled])
+def test_streams_and_threads(kind):
+    rule = make_rule(kind=kind)
     cases = [(worlds(seed=k), k) for k in range(4)]
     expected = [run(rule, *given, seed=k, cuda_graph=False) for given, k in cases]
 

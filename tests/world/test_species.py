@@ -228,7 +228,7 @@ def with_rule(**options):
         ({"counts": [20.5, 39.5]}, "an entry of counts must be an integer"),
         ({"counts": []}, "1 to 64 species, got 0"),
         ({"density_counts": [60]}, "one for each of 2 species, got 1"),
-        ({"cuda_graph": "yes"}, "cuda_graph must be 'auto', True or False, got 'yes'"),
+        ({"cuda_graph": "yes"}, "cuda_graph must be 'auto', 'whole', True or False, got 'yes'"),
         ({"memory": "little"}, "'store', 'recompute' or 'minimal', got 'little'"),
         ({"update_prob": [0.5]}, "one for each of 2 species, got 1"),
         ({"update_prob": [0.5, 1.5]}, r"lie in \(0, 1\], got 1\.5"),

@@ -250,6 +250,7 @@ def unscaling_kernel(space: SimpleNamespace, module: wp.Module, state_gradient: 
         starts: wp.array[wp.int32],
         perception: wp.array2d[scalar],
         perception_bar: wp.array2d[scalar],
+        bar_row: wp.array[wp.int32],
         # outputs
         cotangents: wp.array[FOUR_CHANNELS],
     ):
@@ -267,14 +268,17 @@ def unscaling_kernel(space: SimpleNamespace, module: wp.Module, state_gradient: 
             for n in range(wp.static(weight_count)):
                 wide_store(cotangents, index + n * wp.static(parts), FOUR_CHANNELS())
         if row < wp.min(load_integer(starts, starts.shape[0] - 1) - row_base, row_capacity):
+            from_row = row
+            if bar_row.shape[0] > 0:
+                from_row = load_integer(bar_row, row)
             column = state_dim + channel
-            smoothed = read_channels(perception_bar, row, column, 2 * state_dim)
+            smoothed = read_channels(perception_bar, from_row, column, 2 * state_dim)
             wide_store(cotangents, index, smoothed_scale * smoothed)
             if wp.static(state_gradient):
                 column = 2 * state_dim + channel * wp.static(space_dim)
                 end = (2 + wp.static(space_dim)) * state_dim
-                scaled = read_gradients(perception, row, column, end)
-                bars = read_gradients(perception_bar, row, column, end)
+                scaled = read_gradients(perception, from_row, column, end)
+                bars = read_gradients(perception_bar, from_row, column, end)
                 gradient_bars = thread_gradient()
                 for c in range(wp.static(THREAD_CHANNELS)):
                     value = vector()
@@ -322,6 +326,7 @@ def state_kernel(
         row_positions: wp.array[vector],
         row_kernel_sum: wp.array[vector],
         perception_bar: wp.array2d[scalar],
+        bar_row: wp.array[wp.int32],
         cotangents: wp.array[FOUR_CHANNELS],
         flat_cotangents: wp.array[scalar],
         # outputs
@@ -353,8 +358,9 @@ def state_kernel(
         i = load_integer(original_index, wp.min(written, end - 1))
         position = search.load_position(particles, wp.min(k, end - 1))
         own_row = load_integer(row_of, i)
+        from_row = wp.where(bar_row.shape[0] > 0, i, own_row)
         if own_row >= 0 and channel < state_dim:
-            prefetch_columns(perception_bar, own_row, channel)
+            prefetch_columns(perception_bar, from_row, channel)
         cell = space.cell_of(domain, position)
         line = search.line_of(domain, cell)
         address = row_list_address()
@@ -429,7 +435,7 @@ def state_kernel(
             volume_index = written * wp.static(space_dim + 1) + wp.static(space_dim)
             bar = (norm * load_scalar(particles, volume_index)) * total
             if own_row >= 0:
-                bar += read_channels(perception_bar, own_row, channel, state_dim)
+                bar += read_channels(perception_bar, from_row, channel, state_dim)
                 if wp.static(state_gradient):
                     index = (own_row * group_count + g) * wp.static(weight_count * parts) + part
                     kernel_sum = load_vector(row_kernel_sum, own_row)

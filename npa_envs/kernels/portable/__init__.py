@@ -12,6 +12,7 @@ are numbered in sorted order: a number is a row, of perception and of updates.
 - `row_of`: row of each particle, by original index; -1: inactive, or beyond `row_capacity` rows.
 - `row_particle`, `row_index`, `row_positions`: original index, sorted index, position of each row.
   Kernels that sort leave out the rows, or the sorted states, where these arrays are empty.
+- `bar_row`: row of each row's perception, and of the gradient by it; if empty, the same.
 - `width`, `group_count`: channels of a group; groups that the channels of a state fill.
 - `aligned`: 1 if adjacent channels can be read at once; `moving`: 0 if only states change.
 - `x_bar`: dL/dx, the gradient of the loss L with respect to x, called its cotangent; shaped like x.

@@ -85,6 +85,7 @@ def unscaling_kernel(space: SimpleNamespace, module: wp.Module, state_gradient: 
         starts: wp.array[wp.int32],
         perception: wp.array2d[scalar],
         perception_bar: wp.array2d[scalar],
+        bar_row: wp.array[wp.int32],
         # outputs
         smoothed_bar: wp.array[scalar],
         gradient_bar: wp.array[scalar],
@@ -95,13 +96,16 @@ def unscaling_kernel(space: SimpleNamespace, module: wp.Module, state_gradient: 
         row += range_start
         if row >= starts[starts.shape[0] - 1] - row_base:
             return
+        from_row = row
+        if bar_row.shape[0] > 0:
+            from_row = bar_row[row]
         smoothed = scalar(0.0)
         gradient = vector()
         if channel < state_dim:
-            smoothed = perception_bar[row, state_dim + channel]
+            smoothed = perception_bar[from_row, state_dim + channel]
             if wp.static(state_gradient):
                 column = 2 * state_dim + channel * wp.static(space_dim)
-                gradient = gradient_scale * unscaled(perception, perception_bar, row, column)
+                gradient = gradient_scale * unscaled(perception, perception_bar, from_row, column)
         entry = row * group_count + channel / wp.static(width)
         c = channel % wp.static(width)
         smoothed_bar[entry * wp.static(width) + c] = smoothed
@@ -113,7 +117,7 @@ def unscaling_kernel(space: SimpleNamespace, module: wp.Module, state_gradient: 
                 column = 2 * state_dim
                 if wp.static(state_gradient):
                     column += state_dim * wp.static(space_dim)
-                bar = density_scale * unscaled(perception, perception_bar, row, column)
+                bar = density_scale * unscaled(perception, perception_bar, from_row, column)
             density_gradient_bar[row] = bar
 
     return unscale_cotangents
@@ -150,6 +154,7 @@ def state_kernel(
         row_positions: wp.array[vector],
         row_kernel_sum: wp.array[vector],
         perception_bar: wp.array2d[scalar],
+        bar_row: wp.array[wp.int32],
         smoothed_bar: wp.array[space.group],
         gradient_bar: wp.array[space.group_gradient],
         flat_gradient_bar: wp.array[scalar],
@@ -208,12 +213,13 @@ def state_kernel(
             total = entry[wp.static(space_dim)] * total
             i = original_index[k]
             own_row = row_of[i]
+            from_row = wp.where(bar_row.shape[0] > 0, i, own_row)
             for c in range(wp.static(width)):
                 channel = g * wp.static(width) + c
                 if channel < state_dim:
                     bar = total[c]
                     if own_row >= 0:
-                        bar += perception_bar[own_row, channel]
+                        bar += perception_bar[from_row, channel]
                         if wp.static(state_gradient):
                             place = (own_row * group_count + g) * wp.static(space_dim)
                             for d in range(wp.static(space_dim)):

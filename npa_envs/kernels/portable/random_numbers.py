@@ -20,6 +20,8 @@ WEYL_1 = wp.constant(wp.uint32(0xBB67AE85))
 TWO_PI = wp.constant(wp.float64(2.0 * math.pi))
 ULP_24 = wp.constant(wp.float32(2.0**-24))
 ULP_32 = wp.constant(wp.float64(2.0**-32))
+STEP_32 = wp.constant(wp.float32(2.0**-32))
+HALF_STEP_32 = wp.constant(wp.float32(2.0**-33))
 ULP_53 = wp.constant(wp.float64(2.0**-53))
 
 GOLDEN = 0x9E3779B97F4A7C15
@@ -99,6 +101,38 @@ def joined(high: wp.uint32, low: wp.uint32):
 def fraction_53(high: wp.uint32, low: wp.uint32):
     """Return 53 random bits as a number in [0, 1)."""
     return wp.float64(joined(high, low) >> wp.uint64(11)) * ULP_53
+
+
+@wp.kernel(enable_backward=False, module=wp.get_module("npa_envs.kernels.masks_of_torch"))
+def draw_masks(
+    seed: wp.uint64,
+    offset: wp.uint64,
+    increment: wp.uint64,
+    threads: int,
+    probability: float,
+    # outputs
+    masks: wp.array2d[wp.uint8],
+):
+    """Write what `bernoulli_` of torch's CUDA generator draws, for each row of masks.
+
+    A call adds `increment` to the generator's offset. Each of its `threads` draws four words at a
+    time, for elements that are `threads` apart.
+    """
+    row, thread = wp.tid()
+    call = thread / threads
+    block = (offset + wp.uint64(row) * increment) / wp.uint64(4) + wp.uint64(call)
+    counter = words(
+        wp.uint32(block),
+        wp.uint32(block >> wp.uint64(32)),
+        wp.uint32(thread % threads),
+        wp.uint32(0),
+    )
+    drawn = philox(counter, wp.uint32(seed), wp.uint32(seed >> wp.uint64(32)))
+    for k in range(4):
+        element = (4 * call + k) * threads + thread % threads
+        if element < masks.shape[1]:
+            uniform = wp.float32(drawn[k]) * STEP_32 + HALF_STEP_32
+            masks[row, element] = wp.where(uniform < probability, wp.uint8(1), wp.uint8(0))
 
 
 @cached_under_lock()

@@ -414,3 +414,38 @@ def flag_not_finite(scalar: type) -> wp.Kernel:
             finite[0] = wp.uint8(0)
 
     return flag_not_finite
+
+
+@cached_under_lock()
+def report_finite(scalar: type) -> wp.Kernel:
+    """Return the kernel whose threads report whether the numbers that each has read are finite."""
+    module = native.module(f"npa_envs.kernels.finite_reports_{scalar_name(scalar)}")
+    read_quad = make_read_at(wp.types.vector(QUAD, scalar), 16)
+
+    @wp.kernel(module=module, grid_stride=False)
+    def report_finite(
+        thread_count: int,
+        finite: int,
+        values: wp.array[scalar],
+        # outputs
+        reports: wp.array[wp.uint8],
+    ):
+        """Write `finite` or `finite` + 1 for each thread; values are aligned to 16 bytes."""
+        wait_for_previous_kernel()
+        t = wp.tid()
+        if t >= thread_count:
+            return
+        report = finite
+        for first in range(wp.static(QUAD) * t, values.shape[0], wp.static(QUAD) * thread_count):
+            if first <= values.shape[0] - wp.static(QUAD):
+                together = read_quad(values, first)
+                for c in range(wp.static(QUAD)):
+                    if not wp.isfinite(together[c]):
+                        report = finite + 1
+            else:
+                for i in range(first, values.shape[0]):
+                    if not wp.isfinite(values[i]):
+                        report = finite + 1
+        reports[t] = wp.uint8(report)
+
+    return report_finite

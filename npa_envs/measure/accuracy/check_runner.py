@@ -14,7 +14,6 @@ import torch
 
 from npa_envs.errors import NPAError, suggest
 from npa_envs.measure.benchmark_records import Record, aligned, as_objects, time_limit
-from npa_envs.measure.plots import heat_map
 from npa_envs.rule.files import load_rule, rule_digest
 
 Verdict = Literal["pass", "fail", "range", "skipped", ""]
@@ -208,17 +207,13 @@ class StressRecord(Record[CheckResult]):
         counts = Counter(result.verdict for result in self.rows)
         return {verdict: counts[verdict] for verdict in ("pass", "range", "fail", "skipped")}
 
-    def by_group(self) -> dict[str, list[CheckResult]]:
-        """Return results by the name of their group."""
-        groups: dict[str, list[CheckResult]] = {}
-        for result in self.rows:
-            groups.setdefault(result.name.partition("/")[0], []).append(result)
-        return groups
-
     def text(self) -> str:
         """Return a table of each group, what failed checks expected, and the counts, as text."""
         parts = []
-        for results in self.by_group().values():
+        groups: dict[str, list[CheckResult]] = {}
+        for result in self.rows:
+            groups.setdefault(result.name.partition("/")[0], []).append(result)
+        for results in groups.values():
             texts = [result.holds or result.worst() or result.note for result in results]
             width = max(map(len, texts))
             lines = [["check", "verdict", "seconds", "found"]]
@@ -286,20 +281,3 @@ def run_check(check: Check, session: CheckSession) -> CheckResult:
     return replace(
         result, name=check.name, expected=check.expected, seconds=seconds, weights=digest
     )
-
-
-def heat_maps(record: StressRecord) -> dict[str, bytes]:
-    """Return a heat map (a PNG file) by group: metrics / their limits, a row for each check."""
-    drawn = {}
-    for group, results in record.by_group().items():
-        limited = [result for result in results if result.metrics and result.limits]
-        rows = [result.name.partition("/")[2] for result in limited]
-        columns = list(dict.fromkeys(name for result in limited for name in result.limits))
-        fractions = [
-            [result.fraction(name) if name in result.limits else None for name in columns]
-            for result in limited
-        ]
-        if limited:
-            matrices = {f"{group}: metrics over their limits": (rows, columns, fractions)}
-            drawn[group] = heat_map(matrices, colours="RdYlGn_r", largest=1e3)
-    return drawn

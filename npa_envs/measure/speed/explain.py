@@ -122,7 +122,12 @@ def _reasons(
     )
     hidden, output = rule.folded()[:2]
     request = plan.request._replace(
-        row_width=hidden.shape[1], update_width=output.shape[0], hidden_dim=hidden.shape[0]
+        row_width=hidden.shape[1],
+        update_width=output.shape[0],
+        hidden_dim=hidden.shape[0],
+        rollout=gradients == "none",
+        boundary="open" if box is None else "periodic",
+        state_dim=workload.state_dim,
     )
     neighbours = "searched for in each pass"
     if plan.lists_neighbours:

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from datetime import date
 from functools import partial
 from typing import Any
-
-from torch import Tensor
 
 from npa_envs.atomic_files import json_text
 from npa_envs.measure.benchmark_records import (
@@ -30,10 +27,8 @@ from npa_envs.measure.speed.timing import (
     rollout_call,
     timed,
 )
-from npa_envs.rule.rule import NPARule
 from npa_envs.world.capture_cache import release_captures
-from npa_envs.world.rollout import Memory, rollout
-from npa_envs.world.species import rollout_species
+from npa_envs.world.rollout import Memory
 
 # Suite `paper`: inference and training, storing and recomputing.
 
@@ -196,135 +191,6 @@ def _scaling_row(session: TimingSession, axis: str, value: int) -> ScalingRow:
     return ScalingRow(*fields, cost.infer_us, cost.train_us, cost.infer_mib, cost.train_mib)
 
 
-# Suite `skips`: time saved by computations that a scene does not need.
-
-SKIPPED = {
-    "cuda": Workload(2, 8, 4096, 16),
-    "cpu": Workload(2, 1, 4096, 4),
-    "small": Workload(2, 1, 256, 2),
-}
-"""Workload of the suite by `TimingSession.size`."""
-
-
-@dataclass(frozen=True)
-class SkipRow:
-    """A computation that rollouts skip under a condition; times of a step with and without [µs]."""
-
-    left_out: str
-    condition: str
-    done_us: Timing
-    skipped_us: Timing
-    saved: str
-
-
-Skip = tuple[str, str, dict[str, Any], dict[str, Any]]
-"""A computation, the condition to leave it out, and options of `rollout_call` with, without it."""
-
-
-def skips(workload: Workload) -> list[Skip]:
-    """Return all computations that rollouts of a workload can leave out."""
-    side = 2.0 * workload.half_width
-    training: dict[str, Any] = {"train": True}
-    # Cells and densities are computed in each step if positions may have a gradient.
-    rebuilt: dict[str, Any] = {"detach_positions": False}
-    longer = rebuilt | {"steps": 32}
-    static: dict[str, Any] = {"rule": {"static": True}}
-
-    def option(name: str) -> dict[str, Any]:
-        return {"rule": {name: False}}
-
-    return [
-        (
-            "what a backward pass reads: signs of hidden units, volumes, kernel sums",
-            "no gradient is enabled", {"gradients": True}, {},
-        ),
-        (
-            "cotangents of positions and densities",
-            "detach_positions (default)", training | rebuilt, training,
-        ),
-        (
-            "perception, network and lists of inactive particles",
-            "update_prob < 1", {"update_prob": 1.0}, {},
-        ),
-        ("the state gradient", "state_gradient=False", {}, option("state_gradient")),
-        (
-            "the moment matrix and its inverse",
-            "moment_correction=False", {}, option("moment_correction"),
-        ),
-        (
-            "columns of the density gradient",
-            "density_gradient=False", {}, option("density_gradient"),
-        ),
-        ("displacements", "static=True", rebuilt, static | rebuilt),
-        (
-            "cells, densities and neighbour lists",
-            "static=True, without position_noise", static | longer, static | {"steps": 32},
-        ),
-        ("periodic images", "box=None (default)", {"box": (side, side)}, {}),
-        (
-            "a second forward pass, for the backward pass",
-            "memory='store' (default)", training | {"memory": "minimal"}, training,
-        ),
-    ]  # fmt: skip
-
-
-def skip_rows(session: TimingSession) -> list[SkipRow]:
-    """Return a row for each computation of `skips`."""
-    workload = SKIPPED[session.size]
-    x, s = workload.worlds(session.device)
-
-    def cost(options: dict[str, Any]) -> Timing:
-        kwargs: dict[str, Any] = {"steps": workload.steps} | options
-        rolled = replace(workload, steps=kwargs.pop("steps"))
-        run, generator = rollout_call(rolled, x, s, **kwargs)
-        return session.cost(run, generator=generator).time.divided(rolled.steps)
-
-    def row(left_out: str, condition: str, *options: dict[str, Any]) -> SkipRow:
-        return _skip_row(left_out, condition, *map(cost, options))
-
-    return session.rows((skip[0], partial(row, *skip)) for skip in skips(workload))
-
-
-def _skip_row(left_out: str, condition: str, done: Timing, skipped: Timing) -> SkipRow:
-    saved = 1.0 - skipped.median / done.median
-    return SkipRow(left_out, condition, done, skipped, f"{saved:.0%}")
-
-
-# Suite `species`: overhead of `rollout_species` with one species.
-
-SPECIES = {
-    "cuda": (Workload(2, 8, 4096, 16), Workload(2, 1, 256, 16)),
-    "cpu": (Workload(2, 1, 4096, 4), Workload(2, 1, 256, 4)),
-    "small": (Workload(2, 1, 256, 2),),
-}
-"""Workloads of the suite by `TimingSession.size`; ones of few particles show the cost of a call."""
-
-
-def one_species_rows(session: TimingSession) -> list[SkipRow]:
-    """Return rows of what `rollout` skips, on CUDA also where graphs replay the calls."""
-
-    def row(workload: Workload, train: bool, graph: bool) -> SkipRow:
-        x, s = workload.worlds(session.device)
-        counts = [workload.particle_count]
-
-        def roll_species(rule: NPARule, *arguments: Any, **options: Any) -> tuple[Tensor, ...]:
-            options |= {"counts": counts, "density_counts": counts}
-            return rollout_species([rule], *arguments, **options)
-
-        times = []
-        # Both draw the same masks.
-        for roll in (roll_species, rollout):
-            run, generator = rollout_call(workload, x, s, train=train, roll=roll)
-            cost = session.cost(run, graph=graph, generator=generator)
-            times.append(cost.time.divided(workload.steps))
-        what = f"{'training' if train else 'inference'}, {'graph' if graph else 'eager'}"
-        return _skip_row(f"species, {workload.name}", what, *times)
-
-    graphs = (False, True) if session.cuda else (False,)
-    cases = itertools.product(SPECIES[session.size], (False, True), graphs)
-    return session.rows((f"one species, {case}", partial(row, *case)) for case in cases)
-
-
 # The suites
 
 
@@ -343,8 +209,6 @@ SUITES: dict[str, Callable[[TimingSession], Tables]] = {
     "quick": lambda session: paper(replace(session, small=True)),
     "paper": paper,
     "scaling": lambda session: {"scaling": scaling_rows(session)},
-    "skips": lambda session: {"skips": skip_rows(session)},
-    "species": lambda session: {"one_species": one_species_rows(session)},
     "kernels": lambda here: {"kernels": kernel_rows(here, SMALL if here.small else PROFILED)},
 }
 """Suites by name: functions that measure and return their tables."""

@@ -29,7 +29,7 @@ class LossOptions:
     tiles: bool = True
     """Whether the target's opposite edges fit together, so that patches may cross them."""
     seed: int = 0
-    """Seed of the random directions, filters and positions that the loss uses."""
+    """Seed of the random directions and positions that the loss uses."""
     vgg_weights: str = ""
     """File of VGG16's weights, for `vgg_ot`; empty: torch's usual folder of downloads."""
 
@@ -169,11 +169,6 @@ def pyramid(images: Tensor, count: int) -> list[Tensor]:
     return levels
 
 
-def stride_of(level: Tensor, thinned: bool) -> int:
-    """Return the stride [pixels] between compared patches: 1, or if `thinned` 1 or more."""
-    return max(1, level.shape[-1] // MAX_POSITIONS) if thinned else 1
-
-
 def patches(images: Tensor, size: int, *, stride: int, wrap: bool) -> Tensor:
     """Return square patches of images [B, K, R, R], one every `stride` pixels, [B, M, K size²].
 
@@ -197,13 +192,6 @@ def products(rows: Tensor, weights: Tensor) -> Tensor:
     return torch.stack([table @ weights for table in tables])
 
 
-def orthogonal(size: int, count: int, generator: torch.Generator) -> Tensor:
-    """Return `count` random orthonormal vectors as columns, shape [size, count], float64."""
-    normal = torch.randn(size, count, generator=generator, dtype=torch.float64)
-    basis: Tensor = torch.linalg.qr(normal).Q
-    return basis
-
-
 def quantiles(values: Tensor, count: int) -> Tensor:
     """Return evenly spaced quantiles of each row of values [F, M], rising, shape [F, count]."""
     ordered = values.sort(dim=1).values
@@ -217,126 +205,67 @@ def quantiles(values: Tensor, count: int) -> Tensor:
     return ordered[:, low] * (1.0 - part) + ordered[:, (low + 1).clamp(max=total - 1)] * part
 
 
-# Sliced Wasserstein distances. A texture is described, at each image size, by many features at each
-# position. The distributions of a feature over the positions are compared by sorting its values.
+# Sliced Wasserstein distances. A texture is described, at each image size, by its patches in a
+# random basis. Distributions of a coordinate over the positions are compared by sorting its values.
 
 PATCH_SIDE = 5
 """Side of a patch of sliced distances [pixels]."""
-
-FILTERS = 24
-"""Random filters of the first layer; each gives two features, its positive and negative part."""
-
-SECOND_PATCH_SIDE = 3
-"""Side of a filter of the second layer [pixels]."""
 
 VARIANCE_FLOOR = 0.01
 """Added to the target's variance before division by it, so that a uniform target works too."""
 
 
 class SlicedWasserstein(TextureDistance):
-    """The sliced Wasserstein distance of images from a target.
+    """The sliced Wasserstein distance of patches of all channels from those of a target.
 
-    At each image size it is the mean over the features of the squared 1D 2-Wasserstein distance
-    between their distributions, divided by the target's variance; sizes are summed.
-
-    `describe` is the class of features: `PatchDescriptor` or `FilterDescriptor`.
+    At each image size it is the mean over a random orthonormal basis of the squared 1D
+    2-Wasserstein distance between the patches' coordinates, divided by the target's variance; sizes
+    are summed.
     """
 
     same_in_every_batch = True
 
-    def __init__(
-        self, describe: Callable[..., Any], target: Tensor, options: LossOptions = DEFAULT_OPTIONS
-    ) -> None:
+    def __init__(self, target: Tensor, options: LossOptions = DEFAULT_OPTIONS) -> None:
         super().__init__(target)
-        self.descriptor = describe(target, seed=options.seed)
-        """Maps images to features at their positions."""
+        generator = torch.Generator().manual_seed(options.seed)
+        size = target.shape[0] * PATCH_SIDE * PATCH_SIDE
+        self.bases: list[Tensor] = []
+        """Basis of each image size: columns of [K PATCH_SIDE², K PATCH_SIDE²]."""
+        for _ in range(level_count(target.shape[-1])):
+            normal = torch.randn(size, size, generator=generator, dtype=torch.float64)
+            self.bases.append(torch.linalg.qr(normal).Q.to(target))
         with torch.no_grad():
             # The target has as many quantiles as worlds have positions.
-            thinned = self.descriptor(target[None], wrap=True, thinned=True)
-            described = self.descriptor(target[None].double(), wrap=options.tiles, thinned=False)
+            thinned = self.coordinates(target[None], wrap=True, thinned=True)
+            every = self.coordinates(target[None].double(), wrap=options.tiles, thinned=False)
             self._quantiles = [
-                quantiles(features[0].T, compared.shape[1]).to(target)
-                for features, compared in zip(described, thinned, strict=True)
+                quantiles(rows[0].T, compared.shape[1]).to(target)
+                for rows, compared in zip(every, thinned, strict=True)
             ]
-            self._scales = [1.0 / (each[0].var(0).mean() + VARIANCE_FLOOR) for each in described]
+            self._scales = [1.0 / (rows[0].var(0).mean() + VARIANCE_FLOOR) for rows in every]
 
-    def compare(self, images: Tensor) -> Tensor:
-        """Return the distance of images [B, K, R, R] from the target, [B]."""
-        described = self.descriptor(images, wrap=True, thinned=True)
-        total = images.new_zeros(len(images))
-        for features, expected, scale in zip(described, self._quantiles, self._scales, strict=True):
-            ordered = features.transpose(1, 2).contiguous().sort(dim=-1).values
-            squares = (ordered - expected.to(ordered)).square()
-            distance = scalar_world_mean(squares)
-            total = total + scale.to(distance) * distance
-        return total
-
-
-class PatchDescriptor:
-    """Features of images: patches of all channels in a random orthonormal basis."""
-
-    def __init__(self, like: Tensor, *, seed: int) -> None:
-        generator = torch.Generator().manual_seed(seed)
-        size = like.shape[0] * PATCH_SIDE * PATCH_SIDE
-        self.directions = [
-            orthogonal(size, size, generator).to(like) for _ in range(level_count(like.shape[-1]))
-        ]
-        """Basis of each image size: columns of [K PATCH_SIDE², K PATCH_SIDE²]."""
-
-    def __call__(self, images: Tensor, *, wrap: bool, thinned: bool) -> list[Tensor]:
-        """Return features of images [B, K, R, R] at M positions: [B, M, K PATCH_SIDE²] by size.
+    def coordinates(self, images: Tensor, *, wrap: bool, thinned: bool) -> list[Tensor]:
+        """Return M patches of images [B, K, R, R] by size, in its basis: [B, M, K PATCH_SIDE²].
 
         With `wrap` opposite edges are connected, else positions near them are left out. With
         `thinned` there are at most `MAX_POSITIONS` along each side.
         """
-        sizes = pyramid(images, len(self.directions))
-        return [
-            products(
-                patches(level, PATCH_SIDE, stride=stride_of(level, thinned), wrap=wrap), direction
-            )
-            for level, direction in zip(sizes, self.directions, strict=True)
-        ]
-
-
-class FilterDescriptor:
-    """Features of images: two layers of random filters with rectifiers between them.
-
-    One filter of the first layer for each channel is its mean, and the others sum to zero. Filters
-    of the second layer are random projections of patches of the first layer's features.
-    """
-
-    def __init__(self, like: Tensor, *, seed: int) -> None:
-        generator = torch.Generator().manual_seed(seed)
-        channels, area = like.shape[0], PATCH_SIDE * PATCH_SIDE
-        self.levels: list[tuple[Tensor, Tensor]] = []
-        """Filters of the first and of the second layer, as columns, for each image size."""
-        for _ in range(level_count(like.shape[-1])):
-            first = torch.randn(channels * area, FILTERS, generator=generator, dtype=torch.float64)
-            first -= first.mean(0)
-            first /= first.norm(dim=0)
-            means = torch.eye(channels, dtype=torch.float64).repeat_interleave(area, 0) / PATCH_SIDE
-            first[:, :channels] = means
-            second = orthogonal(2 * FILTERS * SECOND_PATCH_SIDE**2, 2 * FILTERS, generator)
-            self.levels.append((first.to(like), second.to(like)))
-
-    def __call__(self, images: Tensor, *, wrap: bool, thinned: bool) -> list[Tensor]:
-        """Return features of images [B, K, R, R] at M positions: two [B, M, 2 FILTERS] by size.
-
-        They are those of the two layers. `wrap` and `thinned` are as of `PatchDescriptor`.
-        """
         result = []
-        for level, (first, second) in zip(
-            pyramid(images, len(self.levels)), self.levels, strict=True
-        ):
-            signed = products(patches(level, PATCH_SIDE, stride=1, wrap=wrap), first)
-            features = torch.cat((signed, -signed), dim=2).relu()
-            side = level.shape[-1] - (0 if wrap else PATCH_SIDE - 1)
-            field = features.transpose(1, 2).reshape(len(images), -1, side, side)
-            stride = stride_of(level, thinned)
-            result.append(field[:, :, ::stride, ::stride].flatten(2).transpose(1, 2))
-            around = patches(field, SECOND_PATCH_SIDE, stride=stride, wrap=wrap)
-            result.append(products(around, second))
+        for level, basis in zip(pyramid(images, len(self.bases)), self.bases, strict=True):
+            stride = max(1, level.shape[-1] // MAX_POSITIONS) if thinned else 1
+            result.append(products(patches(level, PATCH_SIDE, stride=stride, wrap=wrap), basis))
         return result
+
+    def compare(self, images: Tensor) -> Tensor:
+        """Return the distance of images [B, K, R, R] from the target, [B]."""
+        levels = self.coordinates(images, wrap=True, thinned=True)
+        total = images.new_zeros(len(images))
+        for rows, expected, scale in zip(levels, self._quantiles, self._scales, strict=True):
+            ordered = rows.transpose(1, 2).contiguous().sort(dim=-1).values
+            squares = (ordered - expected.to(ordered)).square()
+            distance = scalar_world_mean(squares)
+            total = total + scale.to(distance) * distance
+        return total
 
 
 # Optimal transport of raw patches.
@@ -546,8 +475,8 @@ def load_vgg_weights(path: str | Path = "") -> dict[str, Any]:
             f"vgg_ot needs VGG16's weights, and there is no file {shown(str(file))}: download "
             f"{WEIGHTS_URL} (528 MiB) to {shown(str(folder / WEIGHTS_FILE))}, for example with "
             f"python -c \"import torch; torch.hub.load_state_dict_from_url('{WEIGHTS_URL}')\", or "
-            "give the path of such a file as vgg_weights, or choose loss='patch_swd' or "
-            "'filter_swd', which need no weights"
+            "give the path of such a file as vgg_weights, or choose loss='patch_swd', which "
+            "needs no weights"
         )
     try:
         with open_regular(file, limit=2**30, what="the file") as opened:
@@ -583,17 +512,10 @@ TEXTURE_LOSSES: Mapping[str, LossEntry] = {
         "the paper's: optimal transport of VGG16 features; needs weights", VGGTransport
     ),
     "patch_swd": LossEntry(
-        "sliced Wasserstein distance of raw patches at several sizes",
-        partial(SlicedWasserstein, PatchDescriptor),
-    ),
-    "filter_swd": LossEntry(
-        "sliced Wasserstein distance of two layers of random filters",
-        partial(SlicedWasserstein, FilterDescriptor),
+        "sliced Wasserstein distance of raw patches at several sizes", SlicedWasserstein
     ),
     "joint_swd": LossEntry(
-        "`patch_swd` of colours and density at once",
-        partial(SlicedWasserstein, PatchDescriptor),
-        joint=True,
+        "`patch_swd` of colours and density at once", SlicedWasserstein, joint=True
     ),
     "patch_ot": LossEntry(
         "relaxed optimal transport of raw patches at several sizes", PatchTransport, joint=True

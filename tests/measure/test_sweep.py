@@ -5,12 +5,13 @@ import os
 import signal
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
+import sweep
 from support.clock import wait_until
+from sweep import combinations, main
 
-from npa_envs.cli import main, sweep
-from npa_envs.cli.sweep import combinations
 from npa_envs.errors import NPAError
 
 CHILD = """
@@ -31,9 +32,9 @@ def child(monkeypatch):
     monkeypatch.setattr(sweep, "PROGRAM", (sys.executable, "-c", CHILD))
 
 
-def call(tmp_path, *words):
-    given = ["sweep", "--over", "seed=0,1", "target=a,b", "--out", str(tmp_path), "--no-progress"]
-    return main([*given, *words, "--", "texture", "--preset", "tiny"])
+def call(tmp_path, *words, preset="tiny"):
+    given = ["--over", "seed=0,1", "target=a,b", "--out", str(tmp_path)]
+    return main([*given, *words, "--", "texture", "--preset", preset])
 
 
 def test_every_combination_is_a_run_with_its_own_words():
@@ -87,16 +88,14 @@ def test_parts_and_time_limits_leave_runs_to_other_calls(tmp_path, child, capsys
     assert call(tmp_path, "--part", "1/2") == 1
     begun = {path.parent.name for path in tmp_path.glob("*/begun")}
     assert begun == {"seed=0,target=a", "seed=1,target=a"}
-    assert main(["sweep", "--out", str(tmp_path)]) == 2
-    assert main(["sweep", "--over", "seed=0", "--part", "3/2", "--", "texture"]) == 2
-    assert "must be K/N" in capsys.readouterr().err
+    with pytest.raises(NPAError, match="jobs must be at least 1"):
+        call(tmp_path, "--jobs", "0")
 
 
-def test_a_folder_with_runs_of_other_words_is_refused(tmp_path, child, capsys):
+def test_a_folder_with_runs_of_other_words_is_refused(tmp_path, child):
     call(tmp_path)
-    words = ["sweep", "--over", "seed=0,1", "target=a,b", "--out", str(tmp_path)]
-    assert main([*words, "--", "texture", "--preset", "fast"]) == 2
-    assert "other settings: words was" in capsys.readouterr().err
+    with pytest.raises(NPAError, match="other settings: words was"):
+        call(tmp_path, preset="fast")
 
 
 SAVING = """
@@ -121,19 +120,20 @@ time.sleep(0.5)
 
 SWEEP = f"""
 import signal, sys
-from npa_envs.cli import main, sweep
+sys.path.insert(0, {str(Path(sweep.__file__).parent)!r})
+import sweep
 
 # Tests that nohup started ignore it, and so would all that they start.
 signal.signal(signal.SIGHUP, signal.SIG_DFL)
 
 sweep.PROGRAM = (sys.executable, "-c", {SAVING!r})
-sys.exit(main(sys.argv[1:]))
+sys.exit(sweep.main(sys.argv[1:]))
 """
 
 
 def in_a_terminal(tmp_path):
     """A sweep of two runs at once, with a group of processes of its own as in a terminal."""
-    words = ["sweep", "--over", "seed=0,1,2", "--out", str(tmp_path), "--no-progress"]
+    words = ["--over", "seed=0,1,2", "--out", str(tmp_path)]
     return subprocess.Popen(
         [sys.executable, "-c", SWEEP, *words, "--jobs", "2", "--", "texture"],
         stdout=subprocess.PIPE, stderr=subprocess.STDOUT, start_new_session=True, encoding="utf-8",

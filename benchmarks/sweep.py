@@ -1,8 +1,19 @@
-"""`npa-envs sweep`: one training run for each combination of options, over several devices."""
+"""One training run for each combination of options, each in its own process, over several devices.
+
+    python benchmarks/sweep.py --over target=heart,ring seed=0,1,2 --devices cuda:0 cuda:1 \\
+        --out runs/sweep -- morphogenesis2d --preset fast
+
+The arguments after `--` are those of `npa-envs train`, the same for all runs. A stopped sweep
+continues: finished runs stay as they are, started ones resume from their checkpoints, failed ones
+are tried again. Ctrl-C or SIGTERM lets runs write checkpoints; a second one ends them at once. The
+exit code is 1 if a run failed.
+"""
 
 from __future__ import annotations
 
+import argparse
 import itertools
+import math
 import os
 import subprocess
 import sys
@@ -10,16 +21,16 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated
 from urllib.parse import quote
 
-import tyro
+from tqdm import tqdm
 
 from npa_envs.atomic_files import read_json, write_text
-from npa_envs.cli import common
 from npa_envs.errors import NPAError, suggest
 from npa_envs.measure.benchmark_records import NONE, markdown_table, read_record, write_record
 from npa_envs.measure.process_queue import Child, Slots, part_of, run_children
+from npa_envs.measure.quality import score_line
+from npa_envs.training import TASKS
 
 RECORD, OUTPUT, TABLE = "run.json", "output.txt", "sweep.md"
 """Files: record and output of a run, and the table of all runs."""
@@ -29,30 +40,7 @@ RESERVED = ("out", "device", "resume", "overwrite", "max-seconds", "processes", 
 
 PROGRAM = (sys.executable, "-m", "npa_envs", "train")
 
-
-@dataclass(frozen=True, kw_only=True)
-class SweepOptions(common.PartOptions):
-    """Train with every combination of some options, each run in its own process.
-
-    The arguments after `--` are those of `npa-envs train`, the same for all runs. A stopped sweep
-    continues: finished runs stay as they are, started ones resume from their checkpoints, failed
-    ones are tried again. Ctrl-C or SIGTERM lets runs write checkpoints; a second one ends them at
-    once. The exit code is 1 if a run failed.
-
-    Examples:
-      npa-envs sweep --over target=heart,ring seed=0,1,2 --devices cuda:0 cuda:1 -- morphogenesis2d
-    """
-
-    over: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME=A,B,C")]
-    """Options of `npa-envs train` with the values to try: target=heart,ring seed=0,1,2."""
-    out: Path = Path("runs/sweep")
-    """Folder with a folder for each run, named by its values, and sweep.md, the table of all."""
-    devices: tuple[str, ...] = ("cpu",)
-    """Devices to distribute the runs over, for example cuda:0 cuda:1."""
-    jobs: int | None = None
-    """Runs at the same time; default: one for each device."""
-    progress: bool = True
-    """Show a progress bar."""
+LEFT = "runs are left: call again with the same arguments"
 
 
 @dataclass
@@ -119,45 +107,6 @@ class SweepRun(Child):
         return record is not None and record[0] == 0
 
 
-def main(arguments: Sequence[str]) -> int:
-    """Train the missing runs, print and write the table; return 1 if a run failed."""
-    split = arguments.index("--") if "--" in arguments else len(arguments)
-    options = common.parse_options(SweepOptions, "sweep", arguments[:split])
-    common.check_numbers(options, jobs=1)
-    folder = common.writable_folder(options.out)
-    runs = combinations(options.over, arguments[split + 1 :], folder)
-    part_runs = part_of(runs, options.part, lambda run: run.folder.name)
-    waiting = [run for run in part_runs if not run.done]
-    slots = Slots(options.devices, options.jobs or len(options.devices))
-    hint = "runs are left: call again with the same arguments"
-    with common.progress_bar(len(waiting), show=options.progress, unit="run") as advance:
-
-        def start(_: Sequence[SweepRun]) -> SweepRun | None:
-            return waiting.pop(0) if waiting else None
-
-        def finished(run: SweepRun) -> None:
-            run.write()
-            write_text(folder / TABLE, table(runs))
-            advance(1)
-
-        try:
-            run_children(start, finished, slots, max_seconds=options.max_seconds)
-        except KeyboardInterrupt:
-            print(f"interrupted; {sum(not run.done for run in part_runs)} {hint}")
-            raise
-    text = table(runs)
-    write_text(folder / TABLE, text)
-    print(text, end="")
-    unfinished = [run for run in part_runs if not run.done]
-    failed = [run for run in unfinished if (run.folder / RECORD).exists()]
-    for run in failed:
-        output = (run.folder / OUTPUT).read_text("utf-8", errors="replace").strip()
-        print(f"{run.folder.name} failed: {' '.join(output[-300:].split())}")
-    if len(unfinished) > len(failed):
-        print(f"{len(unfinished) - len(failed)} {hint}")
-    return 1 if failed else 0
-
-
 def combinations(
     over: Sequence[str], task_words: Sequence[str], folder: Path = Path()
 ) -> list[SweepRun]:
@@ -165,8 +114,6 @@ def combinations(
 
     A run has the arguments `task_words` and its values, and a folder of its own below `folder`.
     """
-    from npa_envs.training import TASKS
-
     if not task_words or task_words[0] not in TASKS:
         hint = suggest(task_words[0], TASKS) if task_words else ", ".join(TASKS)
         raise NPAError(f"the arguments after -- must begin with a task of npa-envs train: {hint}")
@@ -200,8 +147,6 @@ def _option_name(word: str) -> str:
 
 def table(runs: Sequence[SweepRun]) -> str:
     """Return a Markdown table of runs: values, how each ended, wall time [s], reports' scores."""
-    from npa_envs.measure.quality import score_line
-
     rows = []
     for run in runs:
         state, seconds, scores = "not run", NONE, NONE
@@ -213,3 +158,66 @@ def table(runs: Sequence[SweepRun]) -> str:
             scores = "; ".join(score_line(read_json(report)) for report in reports) or NONE
         rows.append([*run.values.values(), state, seconds, scores])
     return markdown_table([*runs[0].values, "run", "seconds", "measured"], rows) + "\n"
+
+
+def parsed(words: Sequence[str]) -> argparse.Namespace:
+    """Return the options of the command line, and as `task_words` what follows `--`."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    add = parser.add_argument
+    add("--over", nargs="+", required=True, metavar="NAME=A,B", help="options and their values")
+    add("--out", type=Path, default=Path("runs/sweep"), help="folder with one for each run")
+    add("--devices", nargs="+", default=["cpu"], help="devices to distribute the runs over")
+    add("--jobs", type=int, help="runs at the same time; default: one for each device")
+    add("--part", metavar="K/N", help="run only the K-th of N parts; machines share --out")
+    add("--max-seconds", type=float, default=math.inf, help="start nothing more after this time")
+    split = words.index("--") if "--" in words else len(words)
+    options = parser.parse_args(words[:split])
+    options.task_words = words[split + 1 :]
+    return options
+
+
+def main(words: Sequence[str]) -> int:
+    """Train the missing runs, print and write the table; return 1 if a run failed."""
+    options = parsed(words)
+    if options.jobs is not None and options.jobs < 1:
+        raise NPAError(f"jobs must be at least 1, got {options.jobs}")
+    runs = combinations(options.over, options.task_words, options.out)
+    part_runs = part_of(runs, options.part, lambda run: run.folder.name)
+    waiting = [run for run in part_runs if not run.done]
+    options.out.mkdir(parents=True, exist_ok=True)
+    with tqdm(total=len(waiting), unit="run") as bar:
+
+        def start(_: Sequence[SweepRun]) -> SweepRun | None:
+            return waiting.pop(0) if waiting else None
+
+        def finished(run: SweepRun) -> None:
+            run.write()
+            write_text(options.out / TABLE, table(runs))
+            bar.update()
+
+        slots = Slots(options.devices, options.jobs or len(options.devices))
+        try:
+            run_children(start, finished, slots, max_seconds=options.max_seconds)
+        except KeyboardInterrupt:
+            print(f"interrupted; {sum(not run.done for run in part_runs)} {LEFT}")
+            return 130
+    text = table(runs)
+    write_text(options.out / TABLE, text)
+    print(text, end="")
+    unfinished = [run for run in part_runs if not run.done]
+    failed = [run for run in unfinished if (run.folder / RECORD).exists()]
+    for run in failed:
+        output = (run.folder / OUTPUT).read_text("utf-8", errors="replace").strip()
+        print(f"{run.folder.name} failed: {' '.join(output[-300:].split())}")
+    if len(unfinished) > len(failed):
+        print(f"{len(unfinished) - len(failed)} {LEFT}")
+    return 1 if failed else 0
+
+
+if __name__ == "__main__":
+    try:
+        sys.exit(main(sys.argv[1:]))
+    except NPAError as error:
+        sys.exit(f"sweep: error: {error}")

@@ -1,0 +1,109 @@
+"""The check that positions are finite, which overlaps with the work launched after it."""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import itertools
+import threading
+import time
+from collections.abc import Iterator
+
+import torch
+from torch import Tensor
+
+from npa_envs.checks import FiniteCheck
+from npa_envs.kernels.portable.update import report_finite
+from npa_envs.ops.launch import SCALARS, is_aligned, launch
+
+THREADS = 2048
+"""Threads that check positions."""
+
+MAX_NUMBERS = 2**18
+"""Maximum number of coordinates that they check; work on more hides torch's slower check."""
+
+PATIENT_READS, QUERY_INTERVAL = 64, 4096
+"""Reads of all reports after which the host lets others run, and asks if the stream has failed."""
+
+
+CHECKS = 100
+"""Number of checks of a thread after which devices report the same words again."""
+
+
+class _Host(threading.local):
+    """A thread's memory for reports by device, and its number of checks."""
+
+    def __init__(self) -> None:
+        self.reports: dict[torch.device, Tensor] = {}
+        self.checks = 0
+
+
+_host = _Host()
+
+
+@contextlib.contextmanager
+def checked_positions(x: Tensor) -> Iterator[None]:
+    """Check that all positions are finite while the block launches work; raise NPAError after it.
+
+    On a CPU they are checked first. Nothing is checked while torch compiles or captures.
+    """
+    # In this order: torch.compile cannot trace the other calls.
+    if torch.compiler.is_compiling() or (x.is_cuda and torch.cuda.is_current_stream_capturing()):
+        yield
+        return
+    check = PositionCheck(x)
+    try:
+        yield
+    finally:
+        check.wait()
+
+
+class PositionCheck:
+    """A check that all positions are finite: it starts when it is made, and `wait` raises.
+
+    On CUDA it is on the current stream, so that `wait` waits only for earlier work. x must not
+    change until then, and a thread waits for one check before it makes another.
+    """
+
+    def __init__(self, x: Tensor) -> None:
+        self._x, self._slow = x.detach(), FiniteCheck(x) if _is_slow(x) else None
+        if self._slow is not None:
+            if not x.is_cuda:
+                self._slow.wait()
+            return
+        reports = _host.reports.get(x.device)
+        if reports is None:
+            reports = torch.zeros(THREADS, dtype=torch.uint8, device="cpu", pin_memory=x.is_cuda)
+            _host.reports[x.device] = reports
+        self._address = reports.data_ptr()
+        # A check before this one that nobody has waited for, after an error, reports other words.
+        _host.checks = _host.checks % CHECKS + 1
+        self._finite = 2 * _host.checks
+        # It writes to the host's memory: a copy and an event would take more CPU time.
+        kernel = report_finite(SCALARS[x.dtype])
+        launch(kernel, THREADS, x.device, THREADS, self._finite, self._x, reports)
+
+    def wait(self) -> None:
+        """Wait for the check, not for work after it; raise NPAError if a position is not finite."""
+        if self._slow is not None:
+            self._slow.wait()
+            return
+        words = bytes([self._finite]), bytes([self._finite + 1])
+        for reads in itertools.count(1):
+            reports = ctypes.string_at(self._address, THREADS)
+            finite, not_finite = map(reports.count, words)
+            if finite == THREADS:
+                return
+            if finite + not_finite == THREADS:
+                break
+            # It raises the device's error, if there is one.
+            if reads % QUERY_INTERVAL == 0 and torch.cuda.current_stream(self._x.device).query():
+                break
+            if reads > PATIENT_READS:
+                time.sleep(0.0)
+        FiniteCheck(self._x).wait()
+
+
+def _is_slow(x: Tensor) -> bool:
+    """Return whether torch checks positions: on a CPU, or if they are many or in any places."""
+    return not (x.is_cuda and x.numel() <= MAX_NUMBERS and x.is_contiguous() and is_aligned(x))
