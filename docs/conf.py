@@ -156,7 +156,7 @@ class CommandHelp(SphinxDirective):
         from npa_envs.cli import main
 
         printed = io.StringIO()
-        terminal = {"COLUMNS": "88", "NO_COLOR": "1"}
+        terminal = {"COLUMNS": "76", "NO_COLOR": "1"}
         with (
             patch.dict(os.environ, terminal),
             patch.object(sys, "argv", ["npa-envs"]),
@@ -166,16 +166,16 @@ class CommandHelp(SphinxDirective):
             main([*self.arguments, "--help"])
         # Descriptions come as one line each, whatever the terminal's width.
         lines = printed.getvalue().strip().splitlines()
-        text = "\n".join(wrapped(line) if len(line) > 88 else line for line in lines)
+        text = "\n".join(wrapped(line) if len(line) > 76 else line for line in lines)
         if not text:
             raise self.error(f"npa-envs {' '.join(self.arguments)} --help prints nothing")
         return [nodes.literal_block(text, text, language="text")]
 
 
 def wrapped(line: str) -> str:
-    """Return a line of a help cut at 88 letters, the rest below the text of its second column."""
+    """Return a line of a help cut at 76 letters, the rest below the text of its second column."""
     columns = re.match(r" +\S+ {2,}", line)
-    return fill(line, 88, subsequent_indent=" " * (columns.end() if columns else 0))
+    return fill(line, 76, subsequent_indent=" " * (columns.end() if columns else 0))
 
 
 def write_formula(translator: Any, node: nodes.Element) -> None:

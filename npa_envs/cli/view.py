@@ -49,7 +49,7 @@ class ViewOptions(common.DeviceOptions):
     particle_count: int | None = None
     """Particles N; default: as trained."""
     seed: int = 12
-    """Seed of the first world; 12 shows a clear first digit with `view digits`."""
+    """Seed of the first world; 12 begins with a digit that is easy to read."""
     threads: int = 1
     """CPU threads of torch and of the kernels; the browser needs a core as well."""
     host: str = "127.0.0.1"
