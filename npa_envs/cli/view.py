@@ -71,14 +71,16 @@ def main(arguments: Sequence[str]) -> int:
     make_world = world_maker(options, device)
     with common.torch_threads(options.threads):
         # Made once before the server starts, so that errors come at once.
-        make_world().close()
+        world = make_world()
+        world.close()
+    from npa_envs.web.environment_world import EnvironmentWorld
     from npa_envs.web.server import Site, address_of, open_port, serve
     from npa_envs.web.training_session import Training
 
-    out = common.writable_folder(options.out)
+    out, acts = common.writable_folder(options.out), isinstance(world, EnvironmentWorld)
     site = Site(
         make_world, films=out, host=options.host, one_at_a_time=device.type == "cuda",
-        training=Training(out, device=options.device),
+        training=None if acts else Training(out, device=options.device),
     )  # fmt: skip
     listener = open_port(options.host, options.port)
     with contextlib.closing(listener), common.torch_threads(options.threads):

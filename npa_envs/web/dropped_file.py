@@ -123,7 +123,8 @@ def main(arguments: Sequence[str]) -> int:
     try:
         read_dropped(path, whole="whole" in arguments[1:])
     except (NPAError, MemoryError) as error:
-        message = str(error) or f"reading it takes more than {MEMORY >> 30} GiB: reduce it"
+        meshes = f"must be a 3D file ({', '.join(MESH_SUFFIXES)}) or a picture"
+        message = str(error).replace("must be a picture", meshes) or f"reading it takes more than {MEMORY >> 30} GiB: reduce it"
         print(f"npa-envs: error: {' '.join(message.split())}")
         return 2
     return 0

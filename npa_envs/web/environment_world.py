@@ -6,15 +6,18 @@ from collections.abc import Callable
 from typing import Any
 
 import gymnasium
+import numpy as np
 from torch import Tensor
 
 from npa_envs.agents.network_policies import load_policy
 from npa_envs.checks import is_whole
 from npa_envs.errors import NPAError, shown, suggest
+from npa_envs.ops import splat, world_mean
 from npa_envs.registration import ALL
 from npa_envs.rule.rule import COLOUR_OFFSET
 from npa_envs.tasks.base import Task
 from npa_envs.tasks.damage import DAMAGE_SIZES
+from npa_envs.tasks.targets.picture_points import PointTarget
 from npa_envs.web.live_world import ColouredWorld, LiveWorld, shows_of
 from npa_envs.web.messages import WorldEvent
 from npa_envs.world.brushes import nearest_image
@@ -50,6 +53,27 @@ def make_environment(
     return env, load_policy(policy, env)
 
 
+def outline_of(target: PointTarget, *, side: int = 64) -> list[float]:
+    """Return line segments [x, y, x, y, ...] around a target's points [length units]."""
+    spots: Any = {"resolution": side, "pixel_size": target.pixel_size}
+    # The density is about 1 inside.
+    height = splat(target.points[None], target.colours[None], **spots)[0, ..., 3].cpu().numpy() - 0.5
+    at = np.linspace(-1.0, 1.0, side)
+    fields = np.stack((*np.meshgrid(at, at), height), axis=-1)
+    # Both triangles of each square of pixels; the outline crosses two sides of a triangle, or none.
+    a, b, c, d = fields[:-1, :-1], fields[:-1, 1:], fields[1:, :-1], fields[1:, 1:]
+    corners = np.concatenate((np.stack((a, b, c), 2), np.stack((d, c, b), 2))).reshape(-1, 3, 3)
+    inside = (corners[..., 2] > 0.0).sum(axis=1)
+    corners, inside = corners[inside % 3 > 0], inside[inside % 3 > 0]
+    # The corner that is alone inside or outside is on both sides that are crossed.
+    order = np.argsort(np.where(inside == 1, -1.0, 1.0)[:, None] * corners[..., 2], axis=1)
+    alone, *others = np.moveaxis(np.take_along_axis(corners, order[..., None], axis=1), 1, 0)
+    share = [alone[:, 2:] / (alone[:, 2:] - one[:, 2:]) for one in others]
+    ends = [alone + part * (one - alone) for part, one in zip(share, others, strict=True)]
+    lines: list[float] = np.concatenate([end[:, :2] for end in ends], 1).round(3).ravel().tolist()
+    return lines
+
+
 class EnvironmentWorld(LiveWorld):
     """The world of an environment whose actions a policy chooses; `make_environment` makes both."""
 
@@ -66,6 +90,10 @@ class EnvironmentWorld(LiveWorld):
             )
         self._physics = self._inner.worlds.physics
         self._episode, self._ended = 0, ""
+        target = getattr(getattr(self._inner.task, "task", None), "target", None)
+        # Worlds of several targets have no outline.
+        one = isinstance(target, PointTarget) and self._inner.task.task.goal_count == 0
+        self._outline = outline_of(target) if one else []
         self.reset(self.seed)
 
     def _begin(self, seed: int | None) -> None:
@@ -90,6 +118,7 @@ class EnvironmentWorld(LiveWorld):
             "title": self._env.spec.id if self._env.spec is not None else type(self._env).__name__,
             "note": f"{self._acting}episode {self._episode}{self._ended}",
             "dimension": self._physics.space_dim,
+            "outline": self._outline,
             "half_width": margin * task.half_width if self.box is None else 0.5 * min(self.box),
             "spot": 0.7 * float(task.pixel_size),
             "class_count": int(getattr(task.config, "class_count", 0)),
@@ -112,9 +141,12 @@ class EnvironmentWorld(LiveWorld):
         for _ in range(steps):
             before = self.particles.x if self.show == "speed" else None
             action = self._policy(self._observation)
+            acted = self._marks(action)
             self._observation, reward, ended, truncated, self._info = self._env.step(action)
             self.step += 1
             self._return += float(reward)
+            acted |= {"type": "acted", "reward": float(reward), "total": self._return}
+            self._events = [*(one for one in self._events if one["type"] != "acted"), acted]
             if before is not None:
                 moved = nearest_image(self.particles.x - before, self.box)
                 self._travelled = moved.norm(dim=-1) / max(self._physics.max_displacement, 1e-12)
@@ -129,6 +161,15 @@ class EnvironmentWorld(LiveWorld):
                 self._begin(None)
                 self._events.append(self.describe())
                 return
+
+    def _marks(self, action: Any) -> dict[str, Any]:
+        """Return `middle` and `pushes` of the event "acted"."""
+        x, task = self.particles.x, self._inner.task
+        if task.controls != "brushes":
+            return {"middle": world_mean(x)[0].tolist(), "pushes": []}
+        pushes = task.pushes(x, self._inner.spaces.action(action, None))
+        middle = task.goal_middle(x, self._inner.worlds.context)
+        return {"middle": middle[0].tolist(), "pushes": pushes[0].tolist()}
 
     @property
     def particles(self) -> Particles:

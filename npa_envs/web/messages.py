@@ -30,6 +30,8 @@ Events are objects with a `type` and these fields:
     file    name, url         a file of a film is ready
     training                  the server's training of a dropped file, at first and after changes:
                               `TrainingEvent` has the fields; engines without one never send it
+    acted   middle, pushes, reward, total    the step of an environment: where the outline's middle
+                              belongs, pushes [x, y, dx, dy], reward, and sum of the rewards
     psnr    value             PSNR of the training's world in this page [dB], see `LearningWorld`
     error   message           a sentence for the user
 """
@@ -57,6 +59,7 @@ class WorldEvent(TypedDict, total=False):
     box: list[float] | None  # Sides of the periodic box [length units]; None: open space.
     centre: list[float]  # Centre of the first view [length units].
     half_width: float  # Half the width of the first view [length units].
+    outline: list[float]  # Lines [x, y, x, y, ...] around the target, from its mean [length units].
     spot: float  # Standard deviation of a particle's spot [length units].
     rules: list[str]  # Values of the setting "rule".
     rule: str | None  # The rule of a newly seeded world.
@@ -83,6 +86,7 @@ class TrainingEvent(TypedDict, total=False):
     name: str  # Name of the file for the user, or the emoji.
     folder: str  # Path of the run's folder.
     note: str  # What was read, or "".
+    preset: str  # Name of the run's preset.
     picture: str  # Name of the picture that is learned, a file to download.
     message: str  # Why it has failed.
     cure: Literal["whole"]  # Upload again with this keyword, which keeps the background.
