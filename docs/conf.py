@@ -152,7 +152,7 @@ class CommandHelp(SphinxDirective):
         from npa_envs.cli import main
 
         printed = io.StringIO()
-        terminal = {"COLUMNS": "88", "NO_COLOR": "1"}
+        terminal = {"COLUMNS": "76", "NO_COLOR": "1"}
         with (
             patch.dict(os.environ, terminal),
             patch.object(sys, "argv", ["npa-envs"]),
@@ -162,7 +162,7 @@ class CommandHelp(SphinxDirective):
             main([*self.arguments, "--help"])
         # Descriptions come as one line each, whatever the terminal's width.
         lines = printed.getvalue().strip().splitlines()
-        text = "\n".join(fill(line, 88) if len(line) > 88 else line for line in lines)
+        text = "\n".join(fill(line, 76) if len(line) > 76 else line for line in lines)
         if not text:
             raise self.error(f"npa-envs {' '.join(self.arguments)} --help prints nothing")
         return [nodes.literal_block(text, text, language="text")]

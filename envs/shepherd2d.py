@@ -119,10 +119,6 @@ class ShepherdTask(GardenTask[Shepherd2DEnvConfig]):
         intact = super().episode_context(start, loss, random)
         return ShepherdEpisode(intact.intact_loss, intact.rise, goal, moments)
 
-    def goal_middle(self, x: Tensor, context: ShepherdEpisode) -> Tensor:
-        """Return the position to reach, or where the creature is, [length units], [B, 2]."""
-        return context.goal if self.config.aim == "move" else super().goal_middle(x, context)
-
     def achieved(self, particles: Particles, context: ShepherdEpisode) -> Tensor:
         """Return achieved goals, [B, 3]: two values by `aim`, and lost fractions (0: intact)."""
         x, s, *_ = particles

@@ -20,7 +20,6 @@ from npa_envs.envs.garden.brush_actions import (
     GardenConfig,
     apply_brushes,
     brush_options,
-    brush_places,
     grid_places,
 )
 from npa_envs.envs.trained_rules import GrownTask, RuleDrivenTask, check_matches_rule, run_rule
@@ -151,17 +150,6 @@ class GardenTask(RuleDrivenTask[Config], GrownTask[Config]):
     def middle(self, x: Tensor) -> Tensor:
         """Return the origin of the places: particles' mean position minus the target's, [B, 2]."""
         return world_mean(x) - self._target_middle
-
-    def goal_middle(self, x: Tensor, context: Any) -> Tensor:
-        """Return where the mean of intact worlds would be [length units], [B, 2]."""
-        return world_mean(x)
-
-    def pushes(self, x: Tensor, action: Tensor) -> Tensor:
-        """Return places and displacements of pushes, [length units], [B, J, 4], for a viewer."""
-        action = action.clamp(-1.0, 1.0)
-        places = self.middle(x)[:, None] + brush_places(action, self.config, self.deficit.places)
-        moved = self.config.push_length * action[..., self.config.brush_layout.push]
-        return torch.cat((places, F.pad(moved, (0, 2 - moved.shape[-1]))), dim=-1)
 
     def observe(self, particles: Particles, loss: Tensor, context: Any) -> Tensor:
         """Return observations [B, O] in the form of `config.observe`: grid, moments or picture."""

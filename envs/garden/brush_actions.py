@@ -168,15 +168,6 @@ def brush_options(config: GardenConfig) -> dict[str, Any]:
     return {"radius": config.brush_radius, "box": box}
 
 
-def brush_places(action: Tensor, config: GardenConfig, grid: Tensor | None = None) -> Tensor:
-    """Return places of the brushes of actions [B, J, W] from the origin, [J, 2] or [B, J, 2]."""
-    if config.actions != "grid":
-        return action[..., config.brush_layout.place]
-    grid = grid_places(config, action.device).to(action) if grid is None else grid
-    # Several agents may each have a brush at every place.
-    return grid.repeat(action.shape[1] // len(grid), 1)
-
-
 def apply_brushes(
     particles: Particles,
     action: Tensor,
@@ -192,9 +183,13 @@ def apply_brushes(
     """
     x, s, *_ = particles
     columns, action = config.brush_layout, action.clamp(-1.0, 1.0)
-    places = middle[:, None] + brush_places(action, config, grid)
+    places = action[..., columns.place]
+    if config.actions == "grid":
+        grid = grid_places(config, x.device).to(x) if grid is None else grid
+        # Several agents may each have a brush at every place.
+        places = grid.repeat(action.shape[1] // len(grid), 1)
     # What all brushes do to a particle is a sum over the brushes near it.
-    total = sums_under_brushes(x, places, action, **brush_options(config))
+    total = sums_under_brushes(x, middle[:, None] + places, action, **brush_options(config))
     if "push" in config.tools:
         x = x + config.push_length * total[..., columns.push]
     if "wipe" in config.tools:

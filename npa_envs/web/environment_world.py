@@ -7,10 +7,12 @@ from typing import Any
 
 import gymnasium
 import numpy as np
+import torch
 from torch import Tensor
 
 from npa_envs.agents.network_policies import load_policy
 from npa_envs.checks import is_whole
+from npa_envs.envs.garden.brush_actions import apply_brushes
 from npa_envs.errors import NPAError, shown, suggest
 from npa_envs.ops import splat, world_mean
 from npa_envs.registration import ALL
@@ -53,25 +55,22 @@ def make_environment(
     return env, load_policy(policy, env)
 
 
-def outline_of(target: PointTarget, *, side: int = 64) -> list[float]:
-    """Return line segments [x, y, x, y, ...] around a target's points [length units]."""
-    spots: Any = {"resolution": side, "pixel_size": target.pixel_size}
+def outline_of(target: PointTarget) -> Any:
+    """Return lines [x, y, dx, dy] around a target's points [length units]."""
+    size, at = target.pixel_size, np.linspace(-1.0, 1.0, 64)
+    picture = splat(target.points[None], target.colours[None], resolution=64, pixel_size=size)
     # The density is about 1 inside.
-    height = splat(target.points[None], target.colours[None], **spots)[0, ..., 3].cpu().numpy() - 0.5
-    at = np.linspace(-1.0, 1.0, side)
+    height = picture[0, ..., 3].cpu().numpy() - 0.5
     fields = np.stack((*np.meshgrid(at, at), height), axis=-1)
-    # Both triangles of each square of pixels; the outline crosses two sides of a triangle, or none.
+    # Triangles between three pixels; the outline crosses two sides of a triangle, or none.
     a, b, c, d = fields[:-1, :-1], fields[:-1, 1:], fields[1:, :-1], fields[1:, 1:]
-    corners = np.concatenate((np.stack((a, b, c), 2), np.stack((d, c, b), 2))).reshape(-1, 3, 3)
-    inside = (corners[..., 2] > 0.0).sum(axis=1)
-    corners, inside = corners[inside % 3 > 0], inside[inside % 3 > 0]
-    # The corner that is alone inside or outside is on both sides that are crossed.
-    order = np.argsort(np.where(inside == 1, -1.0, 1.0)[:, None] * corners[..., 2], axis=1)
-    alone, *others = np.moveaxis(np.take_along_axis(corners, order[..., None], axis=1), 1, 0)
-    share = [alone[:, 2:] / (alone[:, 2:] - one[:, 2:]) for one in others]
-    ends = [alone + part * (one - alone) for part, one in zip(share, others, strict=True)]
-    lines: list[float] = np.concatenate([end[:, :2] for end in ends], 1).round(3).ravel().tolist()
-    return lines
+    first = np.concatenate((np.stack((a, b, c), 2), np.stack((d, c, b), 2))).reshape(-1, 3, 3)
+    last = np.roll(first, 1, axis=1)
+    crossed = (first[..., 2] > 0.0) != (last[..., 2] > 0.0)
+    first, last = first[crossed], last[crossed]
+    share = first[:, 2:] / (first[:, 2:] - last[:, 2:])
+    ends = (first + share * (last - first)).reshape(-1, 2, 3)[..., :2]
+    return np.concatenate((ends[:, 0], ends[:, 1] - ends[:, 0]), axis=1).round(3).tolist()
 
 
 class EnvironmentWorld(LiveWorld):
@@ -90,10 +89,9 @@ class EnvironmentWorld(LiveWorld):
             )
         self._physics = self._inner.worlds.physics
         self._episode, self._ended = 0, ""
-        target = getattr(getattr(self._inner.task, "task", None), "target", None)
-        # Worlds of several targets have no outline.
-        one = isinstance(target, PointTarget) and self._inner.task.task.goal_count == 0
-        self._outline = outline_of(target) if one else []
+        task = getattr(self._inner.task, "task", None)
+        target = getattr(task, "target", None) if getattr(task, "goal_count", 1) == 0 else None
+        self._outline = outline_of(target) if isinstance(target, PointTarget) else []
         self.reset(self.seed)
 
     def _begin(self, seed: int | None) -> None:
@@ -145,7 +143,7 @@ class EnvironmentWorld(LiveWorld):
             self._observation, reward, ended, truncated, self._info = self._env.step(action)
             self.step += 1
             self._return += float(reward)
-            acted |= {"type": "acted", "reward": float(reward), "total": self._return}
+            acted |= {"reward": float(reward), "total": self._return}
             self._events = [*(one for one in self._events if one["type"] != "acted"), acted]
             if before is not None:
                 moved = nearest_image(self.particles.x - before, self.box)
@@ -164,12 +162,17 @@ class EnvironmentWorld(LiveWorld):
 
     def _marks(self, action: Any) -> dict[str, Any]:
         """Return `middle` and `pushes` of the event "acted"."""
-        x, task = self.particles.x, self._inner.task
-        if task.controls != "brushes":
-            return {"middle": world_mean(x)[0].tolist(), "pushes": []}
-        pushes = task.pushes(x, self._inner.spaces.action(action, None))
-        middle = task.goal_middle(x, self._inner.worlds.context)
-        return {"middle": middle[0].tolist(), "pushes": pushes[0].tolist()}
+        x, task, worlds = self.particles.x, self._inner.task, self._inner.worlds
+        moves = getattr(task.config, "aim", "") == "move"
+        middle, pushes = (worlds.context.goal if moves else world_mean(x))[0], x.new_zeros(0)
+        if task.controls == "brushes":
+            # The grid's places as particles: brushes lie there, or move them in other forms.
+            origin, rows = task.middle(x), self._inner.spaces.action(action, None)
+            places = origin[:, None] + task.deficit.places
+            at = Particles(places, x.new_zeros(*places.shape[:2], self._physics.state_dim))
+            moved, _ = apply_brushes(at, rows, origin, task.config)
+            pushes = torch.cat((places, moved.x - places), dim=-1)[0]
+        return {"type": "acted", "middle": middle.tolist(), "pushes": pushes.tolist()}
 
     @property
     def particles(self) -> Particles:

@@ -30,8 +30,8 @@ Events are objects with a `type` and these fields:
     file    name, url         a file of a film is ready
     training                  the server's training of a dropped file, at first and after changes:
                               `TrainingEvent` has the fields; engines without one never send it
-    acted   middle, pushes, reward, total    the step of an environment: where the outline's middle
-                              belongs, pushes [x, y, dx, dy], reward, and sum of the rewards
+    acted   middle, pushes, reward, total    a step of an environment: the outline's middle, pushes
+                              [x, y, dx, dy], the reward and the sum of rewards
     psnr    value             PSNR of the training's world in this page [dB], see `LearningWorld`
     error   message           a sentence for the user
 """
@@ -59,7 +59,7 @@ class WorldEvent(TypedDict, total=False):
     box: list[float] | None  # Sides of the periodic box [length units]; None: open space.
     centre: list[float]  # Centre of the first view [length units].
     half_width: float  # Half the width of the first view [length units].
-    outline: list[float]  # Lines [x, y, x, y, ...] around the target, from its mean [length units].
+    outline: list[list[float]]  # Lines [x, y, dx, dy] around the target, from its mean.
     spot: float  # Standard deviation of a particle's spot [length units].
     rules: list[str]  # Values of the setting "rule".
     rule: str | None  # The rule of a newly seeded world.
@@ -155,7 +155,7 @@ BRUSHES = {
         amounts=(0.5, 1.0),
     ),
     "clump": Brush("positions", "Clump: draws particles together", "frame", amounts=(0.0, 0.25)),
-    "noise": Brush("positions", "Noise: scatters particles", "frame", amounts=(0.0, 0.2)),
+    "noise": Brush("positions", "Noise: scatters particles", "frame", amounts=(0.0, 0.6)),
     "inject": Brush(
         "states",
         "Inject: spreads the state of where you press",

@@ -165,8 +165,8 @@ class Training:
         cuda = self._device != "cpu"
         best = cuda and "best" in task_entry(task).presets
         preset = self._preset or ("best" if best else "fast")
-        picture = {"picture": PICTURE} if flat else {}
-        self._set(state="starting", note=note, preset=preset, **picture)
+        found = {"picture": PICTURE} if flat else {}
+        self._set(state="starting", note=note, preset=preset, **found)
         self._call(
             [
                 "npa_envs", "train", task, f"--target={text}", f"--out={folder}",

@@ -557,14 +557,9 @@ export class Tracers {
   }
 }
 
-// Lines [x, y, across, up, fade] that show a step of an environment: the outline of its target, and pushes as arrows of
-// twice their length.
+// Lines [x, y, across, up, fade] that show a step of an environment: its target's outline, pushes as arrows twice as long.
 export function marksOf(outline, { middle, pushes }) {
-  const marks = pushes.flatMap(([x, y, u, v]) => [[x, y, 2 * u, 2 * v, 1], ...[0.36, -0.36].map((side) =>
+  const arrows = pushes.flatMap(([x, y, u, v]) => [[x, y, 2 * u, 2 * v, 1], ...[0.36, -0.36].map((side) =>
     [x + 2 * u, y + 2 * v, -0.6 * u - side * v, -0.6 * v + side * u, 1])]);
-  for (let k = 0; k < outline.length; k += 4) {
-    const [x, y, toX, toY] = outline.slice(k, k + 4);
-    marks.push([middle[0] + x, middle[1] + y, toX - x, toY - y, 0.6]);
-  }
-  return marks;
+  return [...arrows, ...outline.map(([x, y, u, v]) => [middle[0] + x, middle[1] + y, u, v, 0.6])];
 }

@@ -23,7 +23,7 @@ const MEANINGS = {
   density: "How crowded it is around a particle, from dark to bright.",
   components: "The three directions in which states differ most, as red, green and blue: like colour, like state.",
   species: "Which rule a particle follows.",
-  speed: "How far a particle moved in the last step, from dark to bright.",
+  speed: "How far a particle moved in the last step, from dark to bright: bright are the fastest ones.",
   mask: "Which particles the last step updated (yellow): each with probability p.",
   state: "One channel of the states: blue below zero, grey at zero, orange above.",
 };
@@ -389,7 +389,7 @@ class Brushes {
 
   // The brush's radius [length units]; for a line the width of its gap.
   radius() {
-    return +$("radius").value * (this.chosen.sends === "line" ? 0.4 : 1);
+    return +$("radius").value * (this.chosen.sends === "line" ? 0.8 : 1);
   }
 
   showCursor([column, row]) {

@@ -5,6 +5,7 @@ import { make } from "./plots.js";
 
 const ACTIVE = ["reading", "starting", "learning"];
 const KINDS = "image/*,.glb,.gltf,.obj,.off,.ply,.stl";
+const FOLDED = { open: false, choosing: false };
 const MINE = "npa-envs training"; // of the tab's storage: the id of the training that it has begun
 
 export class TrainingCard {
@@ -53,7 +54,7 @@ export class TrainingCard {
       this.cover.hidden = true;
       if (event.dataTransfer.files[0]) this.take(event.dataTransfer.files[0]);
     });
-    addEventListener("keydown", ({ key }) => { if (key === "Escape") this.fold(); });
+    addEventListener("keydown", ({ key }) => { if (key === "Escape") this.change(FOLDED); });
     addEventListener("paste", ({ clipboardData }) => {
       if (clipboardData.files[0]) this.take(clipboardData.files[0]);
     });
@@ -81,12 +82,9 @@ export class TrainingCard {
 
   // Opens the card, and lets the page show the world of the training.
   show() {
-    const { showing, event: { id } } = this;
-    if (showing !== id) {
-      Object.assign(this, { showing: id, psnr: null });
-      this.send({ type: "training", action: "show" });
-    }
-    this.change({ open: true, choosing: false });
+    const { event: { id }, psnr } = this, shown = this.showing === id;
+    if (!shown) this.send({ type: "training", action: "show" });
+    this.change({ showing: id, psnr: shown ? psnr : null, open: true, choosing: false });
   }
 
   leave() {
@@ -109,10 +107,6 @@ export class TrainingCard {
     card.className = shown;
     // On a phone the card lies above the bar.
     card.style.setProperty("--bar", `${document.getElementById("bar").offsetHeight}px`);
-  }
-
-  fold() {
-    this.change({ open: false, choosing: false });
   }
 
   // Renders with changed fields.
@@ -189,7 +183,7 @@ export class TrainingCard {
 
   // A title, and a button that folds the card.
   heading(words) {
-    const close = button("\u00D7", () => this.fold());
+    const close = button("\u00D7", () => this.change(FOLDED));
     close.setAttribute("aria-label", "Fold");
     return row(make("h2", { textContent: words }), close);
   }
