@@ -44,7 +44,7 @@ def parse_options(
     does. The help begins with `description`, by default the dataclass's docstring.
     """
     # tyro keeps the line breaks of indented docstrings.
-    docstring_parser.parse_from_object = _parse_docstring
+    docstring_parser.parse_from_object = _parse_docstring  # type: ignore[assignment]
     kwargs: dict[str, Any] = {} if default is None else {"default": default}
     kwargs["config"] = tyro.conf.OmitArgPrefixes, tyro.conf.DisallowNone, tyro.conf.SuppressFixed
     try:
