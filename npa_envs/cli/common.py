@@ -15,7 +15,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
-import docstring_parser
 import tyro
 from tqdm import tqdm
 
@@ -43,8 +42,6 @@ def parse_options(
     Ends the process after `--help`; raises NPAError for a wrong argument and where the dataclass
     does. The help begins with `description`, by default the dataclass's docstring.
     """
-    # tyro keeps the line breaks of indented docstrings.
-    docstring_parser.parse_from_object = _parse_docstring  # type: ignore[assignment]
     kwargs: dict[str, Any] = {} if default is None else {"default": default}
     kwargs["config"] = tyro.conf.OmitArgPrefixes, tyro.conf.DisallowNone, tyro.conf.SuppressFixed
     try:
@@ -85,14 +82,6 @@ def parse_options(
                 raise NPAError(f"unknown option {word!r}: {hint or 'see --help'}") from end
         raise NPAError(f"{_first_message(said.getvalue())}: see npa-envs {command} --help") from end
     return options
-
-
-def _parse_docstring(source: Any, *, parse: Any = docstring_parser.parse_from_object) -> Any:
-    """Return a class's docstring as `docstring_parser` does, each field's text in one line."""
-    docstring = parse(source)
-    for field in docstring.params:
-        field.description = field.description and " ".join(field.description.split())
-    return docstring
 
 
 def _first_message(said: str) -> str:
