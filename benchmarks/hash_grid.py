@@ -65,7 +65,9 @@ class _GridFields(torch.autograd.Function):
                 for tensor in (s.reshape(total, state_dim).contiguous(), blur, gradient)
             )
             vectors, matrices = kernels.vector, kernels.matrix
-            points, world, density = map(_constant, (points, world, rho), (kernels.point, None, None))
+            points, world, density = map(
+                _constant, (points, world, rho), (kernels.point, None, None)
+            )
             others = _constant(moment, matrices), _constant(drho, vectors)
             given = [domain, scalar(eps), grid.id, points, world, density]
             where = {"dim": total, "device": warp_device(x.device)}

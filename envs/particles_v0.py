@@ -91,7 +91,7 @@ class ParticlesEnv(CrowdEnv):
     | `loss` | its current loss |
     | `loss_separation`, ... | the same by the name of its term, see above |
     | `reward_separation`, ... | its decrease in this step |
-    | `reason` | why the particle's episode ended; 0 before |
+    | `reason` | why its episode ended, a number of [these words](MultiSpecies.md#info); 0 before |
 
     ## Arguments
 

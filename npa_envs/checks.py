@@ -152,7 +152,7 @@ def check_device(name: str | torch.device) -> torch.device:
 
 
 class FiniteCheck:
-    """A check that all positions are finite: it starts when it is made, and `wait` raises.
+    """A check that all positions, not states, are finite: it starts when made, and `wait` raises.
 
     x must not change until `wait` returns.
     """

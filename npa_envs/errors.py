@@ -68,6 +68,10 @@ class UnknownKeywordError(NPAError, TypeError):
     Libraries recognise that error and leave the keyword out.
     """
 
+    def __init__(self, message: str) -> None:
+        # Gymnasium makes the error again with these words at its end.
+        super().__init__(message.replace(" was raised from the env", ".\nRaised from the env"))
+
 
 class MissingDependencyError(NPAError, ImportError):
     """An optional dependency is not installed; the message has the command that installs it."""

@@ -215,7 +215,7 @@ class InvasionConfig(OnePictureConfig):
 
 
 class InvasionTask(PictureLossTask):
-    """Species 0 grows a picture; the others, invaders, share minus its reward in equal parts."""
+    """Species 0 grows a picture; the others, invaders, share minus its reward equally."""
 
     config_type = InvasionConfig
 

@@ -28,14 +28,6 @@ if TYPE_CHECKING:
 
 OptionsT = TypeVar("OptionsT")
 
-# tyro keeps the line breaks of a field's docstring, because its lines are indented.
-with contextlib.suppress(KeyError, AttributeError):
-    _docstrings = vars(tyro)["_docstrings"]
-    _parse = _docstrings.parse_docstring_from_object
-    _docstrings.parse_docstring_from_object = lambda cls: {
-        name: " ".join(text.split()) for name, text in _parse(cls).items()
-    }
-
 
 def parse_options(
     cls: type[OptionsT],

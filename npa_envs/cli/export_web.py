@@ -28,7 +28,7 @@ class ExportOptions:
     rules: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="RULE")] = ()
     """Shipped rules (`npa-envs list`), folders of runs, or files of rules."""
     out: Path = Path("page.html")
-    """The file to write."""
+    """The file to write; its folder is created where missing."""
     gallery: bool = False
     """Begin with pictures to choose from; without RULE: of all shipped 2D rules."""
     title: str | None = None
@@ -59,17 +59,16 @@ def main(arguments: Sequence[str]) -> int:
         title = title or "Neural Particle Automata"
     if not sources:
         raise NPAError("name at least one RULE, or --gallery for all shipped 2D rules")
+    common.writable_folder(options.out.parent)
+    count = options.particle_count
     if collection:
         names = distinct_names(sources, "a collection")
-        rules = [load_rule(source) for source in sources]
-        count = options.particle_count
+        rules = dict(zip(names, map(load_rule, sources), strict=True))
         counts = None if count is None else dict.fromkeys(names, count)
-        save_demo_json(dict(zip(names, rules, strict=True)), options.out, particle_counts=counts)
+        save_demo_json(rules, options.out, particle_counts=counts)
     else:
-        export_web(
-            sources, options.out, title=title, particle_count=options.particle_count,
-            previews=options.gallery,
-        )  # fmt: skip
+        previews = options.gallery
+        export_web(sources, options.out, title=title, particle_count=count, previews=previews)
     size = options.out.stat().st_size
     print(f"wrote {options.out} ({size / 1000:.0f} kB)")
     return 0

@@ -97,8 +97,9 @@ def ids() -> Iterator[str]:
 
     def line(env_id: str, steps: int | None, counts: object, cls: type) -> str:
         """Return the line of a small or large variant with these particles, else of `cls`."""
-        text = f"the same, {counts} particles" if counts else inspect.getdoc(cls) or ""
-        return f"  {env_id:<33} {steps:>3}  {text.partition(chr(10))[0]}"
+        same = "one controller for all" if "Central" in env_id else "the same"
+        text = f"{same}, {counts} particles" if counts else inspect.getdoc(cls) or ""
+        return f"  {env_id:<38} {steps:>3}  {text.partition(chr(10))[0]}"
 
     order = [entry.name for entry in ALL]
     for entry in sorted(ALL, key=lambda entry: order.index(entry.name)):

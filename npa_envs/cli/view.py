@@ -48,8 +48,8 @@ class ViewOptions(common.DeviceOptions):
     """Keywords of the environment, for example target=dots eps=0.3 eps0=0.3."""
     particle_count: int | None = None
     """Particles N; default: as trained."""
-    seed: int = 12
-    """Seed of the first world; 12 begins with a digit that is easy to read."""
+    seed: int | None = None
+    """Seed of the first world; default: 5, for `digits` 12, a digit that is easy to read."""
     threads: int = 1
     """CPU threads of torch and of the kernels; the browser needs a core as well."""
     host: str = "127.0.0.1"
@@ -71,14 +71,17 @@ def main(arguments: Sequence[str]) -> int:
     make_world = world_maker(options, device)
     with common.torch_threads(options.threads):
         # Made once before the server starts, so that errors come at once.
-        make_world().close()
+        world = make_world()
+        world.close()
+    from npa_envs.web.environment_world import EnvironmentWorld
     from npa_envs.web.server import Site, address_of, open_port, serve
     from npa_envs.web.training_session import Training
 
     out = common.writable_folder(options.out)
+    learns = not isinstance(world, EnvironmentWorld)
     site = Site(
         make_world, films=out, host=options.host, one_at_a_time=device.type == "cuda",
-        training=Training(out, device=options.device),
+        training=Training(out, device=options.device) if learns else None,
     )  # fmt: skip
     listener = open_port(options.host, options.port)
     with contextlib.closing(listener), common.torch_threads(options.threads):
@@ -100,7 +103,9 @@ def world_maker(options: ViewOptions, device: torch.device) -> Callable[[], Live
     from npa_envs.web.environment_world import EnvironmentWorld, make_environment
     from npa_envs.web.rule_world import RuleWorld, RunWorld
 
-    folder = Path(options.what)
+    folder, seed = Path(options.what), options.seed
+    if seed is None:
+        seed = 12 if options.what == "digits" else 5
     # Ids of Gymnasium end in a version.
     if re.search(r"-v\d+$", options.what) and not folder.exists():
         policy = options.policy
@@ -119,7 +124,7 @@ def world_maker(options: ViewOptions, device: torch.device) -> Callable[[], Live
 
         def make_world() -> LiveWorld:
             env, acting = make_environment(options.what, policy, device=str(device), **keywords)
-            return EnvironmentWorld(env, acting, seed=options.seed, policy_name=policy)
+            return EnvironmentWorld(env, acting, seed=seed, policy_name=policy)
 
         return make_world
     if options.policy != "zero" or options.keywords:
@@ -128,7 +133,7 @@ def world_maker(options: ViewOptions, device: torch.device) -> Callable[[], Live
             f"{name} is for environments, got --{name} with a rule or a run: leave it out"
         )
     common.check_has_rule(options.what)
-    kwargs: Any = {"device": device, "seed": options.seed, "particle_count": options.particle_count}
+    kwargs: Any = {"device": device, "seed": seed, "particle_count": options.particle_count}
     run_files = ("config.json", "log.jsonl", "checkpoint.pt")
     if folder.is_dir() and any((folder / name).exists() for name in run_files):
         return lambda: RunWorld(folder, **kwargs)

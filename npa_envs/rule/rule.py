@@ -207,7 +207,7 @@ class NPARule(nn.Module):
 
     def _check_sizes(self) -> None:
         if not is_whole(self.space_dim) or self.space_dim not in (2, 3):
-            raise NPAError(f"space_dim must be 2 or 3, got {shown(self.space_dim)}")
+            raise NPAError(f"space_dim must be 2 or 3, got {shown(self.space_dim)}: try 2")
         check_positive(self, int, "state_dim", "hidden_dim", "mixed_vectors", at_most=MAX_DIM)
         others = ("readout_dim", "readout_hidden_dim", "species_count", "code_dim")
         check_positive(self, int, *others, at_least=0, at_most=MAX_DIM)
@@ -547,5 +547,6 @@ def check_rule(rule: Any) -> None:
     """Raise NPAError unless an object is a rule, or one that `torch.compile` has wrapped."""
     if not isinstance(rule, NPARule) and not isinstance(getattr(rule, "_orig_mod", None), NPARule):
         raise NPAError(
-            f"rule must be an NPARule, got {type(rule).__name__}: load it with npa_envs.load_rule"
+            f"rule must be an NPARule, got {type(rule).__name__}: subclass npa_envs.NPARule "
+            "(docs/own_rule.md), or load one with npa_envs.load_rule"
         )

@@ -268,7 +268,8 @@ class TrainingCycle:
         self.batch.start.copy_(worlds)
         if self.batch.wounds is not None and self.pool.wounds is not None:
             wounds = self.task.wounds_between(before, worlds)
-            assert wounds is not None and expired is not None, "a picture, and max_age_range"
+            assert wounds is not None, "wounds of a picture"
+            assert expired is not None, "a weight of wounds needs max_age_range"
             old = self.pool.wounds.index_select(0, self._index)
             hurt = wounds.amax((1, 2), keepdim=True) > 0
             wounds = torch.where(hurt, wounds, old)

@@ -18,19 +18,14 @@ from types import FrameType
 from typing import Any
 
 import numpy as np
+import torch.nn.functional as F
 from torch import Tensor
 
-from npa_envs.atomic_files import (
-    made_folder,
-    read_bytes,
-    remove_unfinished,
-    write_bytes,
-    write_text,
-)
+from npa_envs.atomic_files import made_folder, read_bytes, remove_unfinished, write_text
 from npa_envs.checks import is_real, is_whole
 from npa_envs.errors import NPAError, shown
 from npa_envs.render.colours import to_uint8
-from npa_envs.render.picture_files import encode_frame
+from npa_envs.render.picture_files import encode_frame, write_filmstrip
 from npa_envs.training.checkpoint import load_checkpoint, save_checkpoint
 from npa_envs.training.process_group import ProcessGroup
 
@@ -372,10 +367,7 @@ def _parsed_record(line: str) -> dict[str, Any] | None:
 
 
 PICTURE_HEIGHT = 256
-"""Minimum height of the pictures [pixels]; pixels of smaller ones are repeated."""
-
-PICTURE_GAP = 8
-"""Pixels between the worlds of a picture."""
+"""Minimum height of the pictures [pixels]; smaller ones are enlarged."""
 
 
 class RunLog(JsonlLog):
@@ -414,16 +406,16 @@ class RunLog(JsonlLog):
                 if name != "iteration":
                     self._board.add_scalar(name, value, record["iteration"])
 
-    def add_picture(self, picture: Tensor, iteration: int) -> None:
-        """Write pictures [K, H, W, 3] side by side, as a PNG file and for TensorBoard as a JPEG."""
-        repeats = math.ceil(PICTURE_HEIGHT / picture.shape[1])
-        frames = to_uint8(picture).repeat(repeats, axis=1).repeat(repeats, axis=2)
-        frames = np.pad(frames, ((0, 0), (0, 0), (0, PICTURE_GAP), (0, 0)), constant_values=255)
-        frame = np.concatenate(list(frames), axis=1)[:, :-PICTURE_GAP]
+    def add_picture(self, picture: Tensor, captions: list[str], iteration: int) -> None:
+        """Write pictures [K, H, W, 4] in a row, as a PNG with captions, for TensorBoard a JPEG."""
+        scale = math.ceil(PICTURE_HEIGHT / picture.shape[1])
+        large = F.interpolate(picture.movedim(-1, 1), scale_factor=scale, mode="bilinear")
+        frames = to_uint8(large.movedim(1, -1))
         path = self._folder.pictures / f"{iteration:06d}.png"
-        write_bytes(path, encode_frame(frame, "PNG"))
+        write_filmstrip(path, frames, captions, columns=len(captions))
         if self._board is None:
             return
+        frame = np.concatenate(list(frames), axis=1)
         # Imported here: only runs with TensorBoard need it.
         from tensorboard.compat.proto.summary_pb2 import Summary
 

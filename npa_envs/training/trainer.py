@@ -341,9 +341,11 @@ class Trainer:
             picture = self._cycle.task.picture(end.x, end.s)
         # Worlds with different goals have no common target picture.
         target = getattr(self.task, "target_picture", None) if end.goal is None else None
+        captions = [f"iteration {self.iteration}, world {k}" for k in range(1, len(picture) + 1)]
         if target is not None:
             picture = torch.cat((target[None].to(picture), picture))
-        self._log.add_picture(picture, self.iteration)
+            captions.insert(0, "target")
+        self._log.add_picture(picture, captions, self.iteration)
 
     def _stop_if_diverged(self) -> None:
         statistics = self._cycle.statistics

@@ -124,6 +124,8 @@ def main(arguments: Sequence[str]) -> int:
         read_dropped(path, whole="whole" in arguments[1:])
     except (NPAError, MemoryError) as error:
         message = str(error) or f"reading it takes more than {MEMORY >> 30} GiB: reduce it"
+        kinds = f"must be a 3D file ({', '.join(MESH_SUFFIXES)}) or a picture"
+        message = message.replace("must be a picture", kinds)
         print(f"npa-envs: error: {' '.join(message.split())}")
         return 2
     return 0

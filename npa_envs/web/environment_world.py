@@ -6,15 +6,20 @@ from collections.abc import Callable
 from typing import Any
 
 import gymnasium
+import numpy as np
+import torch
 from torch import Tensor
 
 from npa_envs.agents.network_policies import load_policy
 from npa_envs.checks import is_whole
+from npa_envs.envs.garden.brush_actions import apply_brushes
 from npa_envs.errors import NPAError, shown, suggest
+from npa_envs.ops import splat, world_mean
 from npa_envs.registration import ALL
 from npa_envs.rule.rule import COLOUR_OFFSET
 from npa_envs.tasks.base import Task
 from npa_envs.tasks.damage import DAMAGE_SIZES
+from npa_envs.tasks.targets.picture_points import PointTarget
 from npa_envs.web.live_world import ColouredWorld, LiveWorld, shows_of
 from npa_envs.web.messages import WorldEvent
 from npa_envs.world.brushes import nearest_image
@@ -50,6 +55,24 @@ def make_environment(
     return env, load_policy(policy, env)
 
 
+def outline_of(target: PointTarget) -> Any:
+    """Return lines [x, y, dx, dy] around a target's points [length units]."""
+    size, at = target.pixel_size, np.linspace(-1.0, 1.0, 64)
+    picture = splat(target.points[None], target.colours[None], resolution=64, pixel_size=size)
+    # The density is about 1 inside.
+    height = picture[0, ..., 3].cpu().numpy() - 0.5
+    fields = np.stack((*np.meshgrid(at, at), height), axis=-1)
+    # Triangles between three pixels; the outline crosses two sides of a triangle, or none.
+    a, b, c, d = fields[:-1, :-1], fields[:-1, 1:], fields[1:, :-1], fields[1:, 1:]
+    first = np.concatenate((np.stack((a, b, c), 2), np.stack((d, c, b), 2))).reshape(-1, 3, 3)
+    last = np.roll(first, 1, axis=1)
+    crossed = (first[..., 2] > 0.0) != (last[..., 2] > 0.0)
+    first, last = first[crossed], last[crossed]
+    share = first[:, 2:] / (first[:, 2:] - last[:, 2:])
+    ends = (first + share * (last - first)).reshape(-1, 2, 3)[..., :2]
+    return np.concatenate((ends[:, 0], ends[:, 1] - ends[:, 0]), axis=1).round(3).tolist()
+
+
 class EnvironmentWorld(LiveWorld):
     """The world of an environment whose actions a policy chooses; `make_environment` makes both."""
 
@@ -66,6 +89,9 @@ class EnvironmentWorld(LiveWorld):
             )
         self._physics = self._inner.worlds.physics
         self._episode, self._ended = 0, ""
+        task = getattr(self._inner.task, "task", None)
+        target = getattr(task, "target", None) if getattr(task, "goal_count", 1) == 0 else None
+        self._outline = outline_of(target) if isinstance(target, PointTarget) else []
         self.reset(self.seed)
 
     def _begin(self, seed: int | None) -> None:
@@ -90,6 +116,7 @@ class EnvironmentWorld(LiveWorld):
             "title": self._env.spec.id if self._env.spec is not None else type(self._env).__name__,
             "note": f"{self._acting}episode {self._episode}{self._ended}",
             "dimension": self._physics.space_dim,
+            "outline": self._outline,
             "half_width": margin * task.half_width if self.box is None else 0.5 * min(self.box),
             "spot": 0.7 * float(task.pixel_size),
             "class_count": int(getattr(task.config, "class_count", 0)),
@@ -112,9 +139,12 @@ class EnvironmentWorld(LiveWorld):
         for _ in range(steps):
             before = self.particles.x if self.show == "speed" else None
             action = self._policy(self._observation)
+            acted = self._marks(action)
             self._observation, reward, ended, truncated, self._info = self._env.step(action)
             self.step += 1
             self._return += float(reward)
+            acted |= {"reward": float(reward), "total": self._return}
+            self._events = [*(one for one in self._events if one["type"] != "acted"), acted]
             if before is not None:
                 moved = nearest_image(self.particles.x - before, self.box)
                 self._travelled = moved.norm(dim=-1) / max(self._physics.max_displacement, 1e-12)
@@ -129,6 +159,20 @@ class EnvironmentWorld(LiveWorld):
                 self._begin(None)
                 self._events.append(self.describe())
                 return
+
+    def _marks(self, action: Any) -> dict[str, Any]:
+        """Return `middle` and `pushes` of the event "acted"."""
+        x, task, worlds = self.particles.x, self._inner.task, self._inner.worlds
+        moves = getattr(task.config, "aim", "") == "move"
+        middle, pushes = (worlds.context.goal if moves else world_mean(x))[0], x.new_zeros(0)
+        if task.controls == "brushes":
+            # The grid's places as particles: brushes lie there, or move them in other forms.
+            origin, rows = task.middle(x), self._inner.spaces.action(action, None)
+            places = origin[:, None] + task.deficit.places
+            at = Particles(places, x.new_zeros(*places.shape[:2], self._physics.state_dim))
+            moved, _ = apply_brushes(at, rows, origin, task.config)
+            pushes = torch.cat((places, moved.x - places), dim=-1)[0]
+        return {"type": "acted", "middle": middle.tolist(), "pushes": pushes.tolist()}
 
     @property
     def particles(self) -> Particles:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
@@ -255,7 +256,8 @@ class Colouring:
                 return species_colours(len(world.counts)).repeat(world.counts, axis=0)
             case ["speed"]:
                 speed = _or_zeros(world.travelled, world)
-                return _ramp(speed.clamp(0.0, 1.0).sqrt())
+                fast = speed.kthvalue(math.ceil(0.99 * len(speed))).values.clamp_min(0.01)
+                return _ramp((speed / fast).clamp(0.0, 1.0).sqrt())
             case ["mask"]:
                 tints = world.x.new_tensor(MASK_COLOURS, dtype=torch.float32)
                 return _bytes(tints[_or_zeros(world.updated, world).long()])

@@ -30,6 +30,8 @@ Events are objects with a `type` and these fields:
     file    name, url         a file of a film is ready
     training                  the server's training of a dropped file, at first and after changes:
                               `TrainingEvent` has the fields; engines without one never send it
+    acted   middle, pushes, reward, total    a step of an environment: the outline's middle, pushes
+                              [x, y, dx, dy], the reward and the sum of rewards
     psnr    value             PSNR of the training's world in this page [dB], see `LearningWorld`
     error   message           a sentence for the user
 """
@@ -57,6 +59,7 @@ class WorldEvent(TypedDict, total=False):
     box: list[float] | None  # Sides of the periodic box [length units]; None: open space.
     centre: list[float]  # Centre of the first view [length units].
     half_width: float  # Half the width of the first view [length units].
+    outline: list[list[float]]  # Lines [x, y, dx, dy] around the target, from its mean.
     spot: float  # Standard deviation of a particle's spot [length units].
     rules: list[str]  # Values of the setting "rule".
     rule: str | None  # The rule of a newly seeded world.
@@ -83,6 +86,7 @@ class TrainingEvent(TypedDict, total=False):
     name: str  # Name of the file for the user, or the emoji.
     folder: str  # Path of the run's folder.
     note: str  # What was read, or "".
+    preset: str  # Name of the run's preset.
     picture: str  # Name of the picture that is learned, a file to download.
     message: str  # Why it has failed.
     cure: Literal["whole"]  # Upload again with this keyword, which keeps the background.
@@ -151,7 +155,7 @@ BRUSHES = {
         amounts=(0.5, 1.0),
     ),
     "clump": Brush("positions", "Clump: draws particles together", "frame", amounts=(0.0, 0.25)),
-    "noise": Brush("positions", "Noise: scatters particles", "frame", amounts=(0.0, 0.2)),
+    "noise": Brush("positions", "Noise: scatters particles", "frame", amounts=(0.0, 0.6)),
     "inject": Brush(
         "states",
         "Inject: spreads the state of where you press",

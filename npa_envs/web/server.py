@@ -422,12 +422,14 @@ class ViewerSession:
 
     def _end_film(self, pictures: list[bytes]) -> None:
         def write() -> None:
+            written: list[Path] = []
             try:
-                for path in write_film(pictures, self._site.films):
-                    url = f"films/{path.name}{self._site.query}"
-                    self._send_event({"type": "file", "name": path.name, "url": url})
+                written += write_film(pictures, self._site.films)
             except NPAError as error:
                 self._send_error(str(error))
+            for path in written:
+                url = f"films/{path.name}{self._site.query}"
+                self._send_event({"type": "file", "name": path.name, "url": url})
 
         self._pictures = None
         # In a thread, so that the world keeps running.

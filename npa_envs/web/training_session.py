@@ -159,16 +159,18 @@ class Training:
             return self._set(state="stopped")
         flat = (folder / PICTURE).exists()
         note = output.removeprefix(f"{stored.name}: ").strip()
-        self._set(state="starting", note=note, **({"picture": PICTURE} if flat else {}))
         task = "morphogenesis2d" if flat else "morphogenesis3d"
         target = folder / PICTURE if flat else stored
         text = stored.read_text("utf-8") if stored.name == EMOJI else target
         cuda = self._device != "cpu"
         best = cuda and "best" in task_entry(task).presets
+        preset = self._preset or ("best" if best else "fast")
+        found = {"picture": PICTURE} if flat else {}
+        self._set(state="starting", note=note, preset=preset, **found)
         self._call(
             [
                 "npa_envs", "train", task, f"--target={text}", f"--out={folder}",
-                f"--preset={self._preset or ('best' if best else 'fast')}",
+                f"--preset={preset}",
                 f"--device={self._device}", f"--checkpoint-interval={CHECKPOINTS[cuda]}",
                 "--picture-interval=0", "--no-tensorboard", "--no-progress", "--no-report",
                 *(["--keep-background"] if whole and flat else []),

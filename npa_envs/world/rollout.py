@@ -238,7 +238,7 @@ def rollout(
 
     Raises:
         NPAError: Shapes, dtypes or devices do not fit each other or the rule, a position is not
-            finite, or a number is out of its range.
+            finite (only `on_divergence="raise"` checks states), or a number is out of its range.
         DivergedError: A world diverged and `on_divergence` is "raise"; the message says which, in
             which step, and which number of which particle.
     """

@@ -649,9 +649,10 @@ def test_episodes_follow_each_other(episodes):
     first = episodes.frame().positions.copy()
     advance(episodes, 2)
     assert episodes.frame().step == 2
-    assert episodes.take_events() == []
+    (acted,) = episodes.take_events()
+    assert acted["total"] == episodes._return
     episodes.advance()
-    curve, description = episodes.take_events()
+    _, curve, description = episodes.take_events()
     assert curve["name"] == "Return"
     assert curve["points"][0][0] == 1
     assert "policy zero, episode 2; the last one ended after 3 steps" in description["note"]
@@ -659,6 +660,32 @@ def test_episodes_follow_each_other(episodes):
     assert not np.array_equal(episodes.frame().positions, first)
     episodes.handle({"type": "reset", "seed": 0})
     np.testing.assert_array_equal(episodes.frame().positions, first)
+
+
+def test_the_pushes_of_a_policy_and_the_outline_of_the_target_are_shown():
+    env = small_environment("npa/Gardener2D-v0")
+    action = np.zeros(env.action_space.shape, np.float32)
+    action[:2] = 0.5, -1.0
+    world = EnvironmentWorld(env, lambda observation: action)
+    outline = np.array(world.describe()["outline"])
+    # Closed lines: each end is also that of another line.
+    ends = np.concatenate((outline[:, :2], outline[:, :2] + outline[:, 2:]))
+    away = np.abs(ends[:, None] - ends).sum(-1)
+    assert np.sort(away, axis=1)[:, 1].max() < 0.005
+    target = world._inner.task.task.target
+    for side in (np.min, np.max):
+        want = side(target.points.numpy(), axis=0)
+        np.testing.assert_allclose(side(ends, axis=0), want, atol=target.pixel_size)
+    x, config = world.particles.x[0], world._inner.task.config
+    world.advance()
+    (acted,) = world.take_events()
+    corner = x.mean(dim=0) - config.place_reach
+    np.testing.assert_allclose(acted["middle"], x.mean(dim=0), atol=1e-5)
+    np.testing.assert_allclose(acted["pushes"][0][:2], corner, atol=1e-2)
+    push = config.push_length * action[:2]
+    np.testing.assert_allclose(acted["pushes"][0][2:], push, atol=1e-5)
+    assert acted["pushes"][-1][2:] == [0.0, 0.0]
+    world.close()
 
 
 def test_hands_reach_into_environments(episodes):

@@ -217,6 +217,23 @@ def test_the_ends_of_a_slider_lie_within_its_range(run, low, high, scale):
     assert math.isclose(last, high, rel_tol=5e-3)
 
 
+def test_what_an_agent_does_is_drawn_over_the_world_and_its_reward_written(run):
+    lines, words = run("""
+        let drawn;
+        page.painter = { draw: (scene) => (drawn = [...scene.trails.positions]) };
+        listen({ ...world, outline: [[0, 1, 0.5, 0]] });
+        listen({ type: "acted", middle: [2, 0], pushes: [[0, 0, 0, 1]], reward: 0.5, total: 3 });
+        listen(frame(1));
+        tick();
+        return [drawn, element("step").textContent];
+    """)
+    # The push is twice as long, with the two sides of its head; then the outline.
+    assert lines[:6] == [0, 0, 0, 0, 2, 0]
+    assert lines[-6:] == [2, 1, 0, 2.5, 1, 0]
+    assert len(lines) == 4 * 6
+    assert words == "step 1 · 2 particles · reward 0.5, so far 3"
+
+
 def test_tracers_draw_no_line_between_particles_that_have_changed_places(run):
     before, after = run("""
         element("tracers").checked = true;

@@ -372,6 +372,7 @@ def test_a_drop_is_watched_in_its_tab_and_offered_in_another(new_page, tmp_path)
         )
 
     says = "document.getElementById('training').innerText"
+    escape = "dispatchEvent(new KeyboardEvent('keydown', { key: 'Escape', bubbles: true }))"
     try:
         for page in (first, second):
             page.open(server.address_of(site, listener), DESK)
@@ -397,6 +398,12 @@ def test_a_drop_is_watched_in_its_tab_and_offered_in_another(new_page, tmp_path)
         # A page that is loaded again goes on with what it has begun.
         first.run("location.reload()")
         first.wait("document.page.world.title === 'disk.png'")
+        first.run("(sessionStorage.clear(), location.reload())")
+        first.wait(f"document.page.frame.step > 1 && {says} === 'disk.png is learned: watch'")
+        first.run("document.querySelector('#training button').click()")
+        first.wait(f"document.page.world.title === 'disk.png' && {says}.includes('Learned in')")
+        first.run(f"document.body.{escape}")
+        assert first.run(says) == "Grow your own picture"
         assert not first.complaints
         assert all("409" in complaint for complaint in second.complaints)
     finally:

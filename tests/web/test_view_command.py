@@ -111,7 +111,10 @@ def test_the_link_is_printed_and_opened(host, capsys, monkeypatch, tmp_path):
     output = capsys.readouterr().out
     assert opened[0] in output
     assert "no browser was found here: open the link in yours" in output
-    (site,) = served
+    assert main(["view", "npa/Morphogenesis2DSmall-v0", *words[2:], "--out", str(tmp_path)]) == 0
+    site, of_environment = served
+    # What a page of an environment drops is not learned.
+    assert (site.training is None, of_environment.training is None) == (False, True)
     assert ("?token=" in opened[0]) == (host == "0.0.0.0")
     assert site.token is None or opened[0].endswith(site.token)
 

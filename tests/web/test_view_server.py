@@ -411,7 +411,7 @@ def test_without_ffmpeg_there_is_a_gif(client, site, monkeypatch):
 
     monkeypatch.setattr(server, "write_mp4", refuse)
     with recording(client, [jpeg()]) as reader:
-        file, error = (next_event(reader, "file", "error") for _ in range(2))
+        error, file = (next_event(reader, "file", "error") for _ in range(2))
     assert error["message"] == "an MP4 file needs imageio with ffmpeg"
     (gif,) = site.films.iterdir()
     assert (file["name"], gif.suffix) == (gif.name, ".gif")

@@ -29,7 +29,8 @@ export class Colouring {
     } else if (show === "species") {
       writeColours(bytes, (i) => entryOf(species, world.species[i]));
     } else if (show === "speed") {
-      writeColours(bytes, (i) => between(ramp, Math.sqrt(live.travelled[i] || 0)));
+      const fast = Math.max(0.01, live.travelled.slice().sort()[Math.ceil(0.99 * world.count) - 1] || 0);
+      writeColours(bytes, (i) => between(ramp, Math.sqrt((live.travelled[i] || 0) / fast)));
     } else if (show === "mask") {
       writeColours(bytes, (i) => entryOf(mask, live.updated[i]));
     } else {

@@ -101,7 +101,7 @@ function dot(a, b) {
 // What a painter draws:
 //   {positions, colours, dimension, box, spot, camera, background: [r, g, b] in [0, 1],
 //    look: "soft" | "points", still: nothing moves, which allows slow drawing,
-//    trails: {positions: Float32Array of pairs of points [x, y, z], fades: Float32Array} or null,
+//    trails: {positions: Float32Array of pairs of points [x, y, z], fades: Float32Array},
 //    ink: [r, g, b] of trails}
 // `kind`: "webgl2", "canvas", or "auto": WebGL2 unless it runs on the CPU, which is faster without it.
 export function makePainter(canvas, kind = "auto") {
@@ -271,7 +271,7 @@ class GlPainter {
       gl.uniform3fv(show.background, background);
       gl.drawArrays(gl.TRIANGLES, 0, 3);
     }
-    if (scene.trails) this.drawTrails(scene, width, height);
+    this.drawTrails(scene, width, height);
   }
 
   setCamera(program, { camera }, width, height) {
@@ -387,7 +387,7 @@ class PlainPainter {
     context.imageSmoothingEnabled = true;
     context.imageSmoothingQuality = "low";
     context.drawImage(small, 0, 0, width, height);
-    if (scene.trails) this.drawTrails(scene, width, height);
+    this.drawTrails(scene, width, height);
     if (scene.still) return;
     const taken = performance.now() - started, [least, most] = PLAIN_PIXELS;
     // In steps, so that the picture is not allocated again in every frame.
@@ -398,7 +398,7 @@ class PlainPainter {
   drawTrails({ trails, ink, camera }, width, height) {
     const { context } = this;
     context.lineWidth = 1.5;
-    context.strokeStyle = `rgba(${ink.map((v) => Math.round(255 * v)).join(",")},0.5)`;
+    context.strokeStyle = `rgba(${ink.map((v) => Math.round(255 * v)).join(",")},0.65)`;
     context.beginPath();
     for (let k = 0; k < trails.positions.length; k += 6) {
       const [from, to] = [k, k + 3].map((at) =>
@@ -540,9 +540,10 @@ export class Tracers {
     if (this.frames.length > TRAIL_LENGTH) this.frames.shift();
   }
 
-  // Lines from frame to frame, older ones fainter; none across a box's edge.
-  lines(box) {
-    const points = [], fades = [], longest = box ? Math.min(...box) / 2 : Infinity;
+  // The lines of `marksOf`, and from frame to frame, older ones fainter; none across a box's edge.
+  lines(box, marks = []) {
+    const points = marks.flatMap(([x, y, across, up]) => [x, y, 0, x + across, y + up, 0]);
+    const fades = marks.flatMap(([, , , , fade]) => [fade, fade]), longest = box ? Math.min(...box) / 2 : Infinity;
     for (let f = 1; f < this.frames.length; f++) {
       const from = this.frames[f - 1], to = this.frames[f];
       const fade = 0.75 * (f / this.frames.length) ** 1.5;
@@ -554,4 +555,11 @@ export class Tracers {
     }
     return { positions: new Float32Array(points), fades: new Float32Array(fades) };
   }
+}
+
+// Lines [x, y, across, up, fade] that show a step of an environment: its target's outline, pushes as arrows twice as long.
+export function marksOf(outline, { middle, pushes }) {
+  const arrows = pushes.flatMap(([x, y, u, v]) => [[x, y, 2 * u, 2 * v, 1], ...[0.36, -0.36].map((side) =>
+    [x + 2 * u, y + 2 * v, -0.6 * u - side * v, -0.6 * v + side * u, 1])]);
+  return [...arrows, ...outline.map(([x, y, u, v]) => [middle[0] + x, middle[1] + y, u, v, 0.6])];
 }

@@ -1,12 +1,12 @@
 // The page: a canvas, brushes, controls and plots. Its engine runs the world; npa_envs/web/messages.py describes
 // engines, and has all messages to them and events from them.
 
-import { Camera, Tracers, makePainter } from "./drawing.js";
+import { Camera, Tracers, makePainter, marksOf } from "./drawing.js";
 import { Plot, make, short } from "./plots.js";
 
 // What missing fields of the event "world" count as.
 const BLANK = {
-  title: "npa-envs", note: "", dimension: 2, box: null, half_width: 1.1, spot: 0.015, rules: [], rule: null,
+  title: "npa-envs", note: "", dimension: 2, box: null, half_width: 1.1, spot: 0.015, outline: [], rules: [], rule: null,
   centre: [0, 0, 0], others: [], species: [], shows: ["colours"], show: "colours", class_count: 0, tools: [],
   damages: [], settings: {}, capabilities: [], playing: true, seed: 0,
 };
@@ -23,7 +23,7 @@ const MEANINGS = {
   density: "How crowded it is around a particle, from dark to bright.",
   components: "The three directions in which states differ most, as red, green and blue: like colour, like state.",
   species: "Which rule a particle follows.",
-  speed: "How far a particle moved in the last step, from dark to bright.",
+  speed: "How far a particle moved in the last step, from dark to bright: bright are the fastest ones.",
   mask: "Which particles the last step updated (yellow): each with probability p.",
   state: "One channel of the states: blue below zero, grey at zero, orange above.",
 };
@@ -79,6 +79,7 @@ class Page {
     this.world = { ...BLANK };
     this.described = false; // whether the event "world" has come
     this.frame = null;
+    this.acted = null; // the last event "acted"
     this.undrawn = 0; // frames received since the last drawing
     this.dirty = true; // whether the picture has changed without a new frame
     this.camera = new Camera(2, BLANK.half_width);
@@ -108,6 +109,7 @@ class Page {
       this.undrawn++;
     } else if (event.type === "world") this.readWorld(event);
     else if (event.type === "curve") this.curve(event);
+    else if (event.type === "acted") this.acted = event;
     else if (event.type === "reordered") this.tracers.clear();
     else if (event.type === "film") this.film.end();
     else if (event.type === "file") this.film.offer(event.name, event.url);
@@ -130,6 +132,7 @@ class Page {
     }
     if (before.rule !== world.rule || before.seed !== world.seed) {
       this.tracers.clear();
+      this.acted = null;
       Object.values(this.plots).forEach((plot) => plot.clear());
     }
     this.described = true;
@@ -197,6 +200,7 @@ class Page {
       const rate = length > 1 ? (1000 * (length - 1)) / (now - this.frameTimes[0]) : 0;
       const count = frame.positions.length / world.dimension;
       $("step").textContent = `step ${frame.step} · ${count} particles`;
+      if (this.acted) $("step").textContent += ` · reward ${short(this.acted.reward)}, so far ${short(this.acted.total)}`;
       $("rate").textContent = world.playing && rate ? `${Math.round(rate)} frames a second` : "";
       if ($("plots").open) Object.values(this.plots).forEach((plot) => plot.draw());
     }
@@ -217,7 +221,7 @@ class Page {
       dimension: world.dimension, box: world.box, spot: world.spot * $("size").value, camera,
       background: this.background, look: $("style").value, ink: this.ink,
       still: still || (!world.playing && !this.brushes.stroke),
-      trails: $("tracers").checked ? this.tracers.lines(world.box) : null,
+      trails: this.tracers.lines(world.box, this.acted ? marksOf(world.outline, this.acted) : []),
     });
     this.film.add();
   }
@@ -385,7 +389,7 @@ class Brushes {
 
   // The brush's radius [length units]; for a line the width of its gap.
   radius() {
-    return +$("radius").value * (this.chosen.sends === "line" ? 0.4 : 1);
+    return +$("radius").value * (this.chosen.sends === "line" ? 0.8 : 1);
   }
 
   showCursor([column, row]) {

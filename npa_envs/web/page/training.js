@@ -5,6 +5,7 @@ import { make } from "./plots.js";
 
 const ACTIVE = ["reading", "starting", "learning"];
 const KINDS = "image/*,.glb,.gltf,.obj,.off,.ply,.stl";
+const FOLDED = { open: false, choosing: false };
 const MINE = "npa-envs training"; // of the tab's storage: the id of the training that it has begun
 
 export class TrainingCard {
@@ -53,6 +54,7 @@ export class TrainingCard {
       this.cover.hidden = true;
       if (event.dataTransfer.files[0]) this.take(event.dataTransfer.files[0]);
     });
+    addEventListener("keydown", ({ key }) => { if (key === "Escape") this.change(FOLDED); });
     addEventListener("paste", ({ clipboardData }) => {
       if (clipboardData.files[0]) this.take(clipboardData.files[0]);
     });
@@ -78,10 +80,11 @@ export class TrainingCard {
     this.render();
   }
 
+  // Opens the card, and lets the page show the world of the training.
   show() {
-    this.showing = this.event.id;
-    this.psnr = null;
-    this.send({ type: "training", action: "show" });
+    const { event: { id }, psnr } = this, shown = this.showing === id;
+    if (!shown) this.send({ type: "training", action: "show" });
+    this.change({ showing: id, psnr: shown ? psnr : null, open: true, choosing: false });
   }
 
   leave() {
@@ -122,7 +125,8 @@ export class TrainingCard {
   }
 
   closed() {
-    const { state, name, iteration = 0, total = Infinity } = this.event, active = ACTIVE.includes(state);
+    const { id, state, name, has_rule, iteration = 0, total = Infinity } = this.event, active = ACTIVE.includes(state);
+    if (!active && has_rule && this.showing !== id) return [button(`${name} is learned: watch`, () => this.show())];
     const share = `Learning ${name}: ${Math.floor((100 * iteration) / total)} %`;
     return [button(active ? share : "Grow your own picture", () => this.change({ open: true, choosing: !active }))];
   }
@@ -137,7 +141,7 @@ export class TrainingCard {
       text("Choose or drop a picture or a 3D file. Particles learn it while you watch."),
       row(button("Choose a file", () => this.file.click())),
       row(text("or an emoji"), emoji, button("Grow", typed)),
-      ...(this.event.has_rule ? [row(button(`Show ${this.event.name}`, () => this.change({ choosing: false })))] : []),
+      ...(this.event.has_rule ? [row(button(`Show ${this.event.name}`, () => this.show()))] : []),
     ];
   }
 
@@ -161,15 +165,15 @@ export class TrainingCard {
   }
 
   learned() {
-    const { id, name, state, folder, seconds, iteration, total } = this.event;
+    const { id, name, state, folder, seconds, iteration, total, preset } = this.event;
     const stem = name.replace(/\.\w+$/, "");
     const link = (label, file, end) => make("a", {
       textContent: label, href: addressOf(`training/${id}/${file}`), download: `${stem}${end}`,
     });
     const how = state === "done" ? `Learned in ${duration(seconds)}` : `Stopped at iteration ${iteration} of ${total}`;
+    const hint = preset === "best" ? " Cut it, wipe a part of it." : " Cuts close; wiped parts may stay grey.";
     return [
-      this.heading(name), ...this.target(),
-      text(this.showing === id ? `${how}. Cut it, wipe a part of it.` : `${how}.`), this.quality(),
+      this.heading(name), ...this.target(), text(`${how}.${this.showing === id ? hint : ""}`), this.quality(),
       row(link("Save rule", "rule.safetensors", ".safetensors"), link("Save page", "page.html", ".html"),
         this.showing === id ? button("Back", () => this.leave()) : this.watch(),
         button("Another", () => this.change({ choosing: true }))),
@@ -179,7 +183,7 @@ export class TrainingCard {
 
   // A title, and a button that folds the card.
   heading(words) {
-    const close = button("\u00D7", () => this.change({ open: false, choosing: false }));
+    const close = button("\u00D7", () => this.change(FOLDED));
     close.setAttribute("aria-label", "Fold");
     return row(make("h2", { textContent: words }), close);
   }
@@ -197,10 +201,10 @@ export class TrainingCard {
     return button("Watch", () => this.show());
   }
 
-  // Loss, and how near the world comes to the picture.
+  // Training loss, and how near the world comes to the picture.
   quality() {
     const { loss, id } = this.event, parts = [];
-    if (loss !== undefined) parts.push(`loss ${loss.toPrecision(3)}`);
+    if (loss !== undefined) parts.push(`training loss ${loss.toPrecision(3)}`);
     if (this.psnr !== null && this.showing === id) parts.push(`PSNR ${this.psnr.toFixed(1)} dB`);
     return text(parts.join(" · "));
   }
