@@ -1,4 +1,8 @@
-"""Calls by which other libraries perceive all particles of a world, and what each leaves out."""
+"""Calls by which other libraries perceive all particles of a world, and what each leaves out.
+
+They give the fields; the correction of gradients (`corrected`), scaling and joining (`assemble`)
+are torch's, where the library has them in its kernels.
+"""
 
 from __future__ import annotations
 
@@ -106,12 +110,17 @@ def sph_warp_core(x: Tensor, s: Tensor, eps: float) -> Tensor:
 
     The moment matrix is the gradient of the positions, in the same call. Masses correct the norms
     of its kernels in 2D, which are 35 / 32 and 2 in place of 4 and 10, over pi. It caches arrays by
-    address and adds to their gradients, so every call begins with empty caches, and every operand
-    is a copy.
+    address and adds to their gradients, so caches are emptied, and every operand is a copy.
     """
     sph = importlib.import_module("sphWarpCore")
-    importlib.import_module("sphWarpCore.utils.wp_util").clearWarpArrayCache()
-    importlib.import_module("sphWarpCore.utils.wp_autograd").clearKernelArgsCache()
+    try:
+        return _sph_warp_core(sph, x, s, eps)
+    finally:
+        importlib.import_module("sphWarpCore.utils.wp_util").clearWarpArrayCache()
+        importlib.import_module("sphWarpCore.utils.wp_autograd").clearKernelArgsCache()
+
+
+def _sph_warp_core(sph: Any, x: Tensor, s: Tensor, eps: float) -> Tensor:
     places, (count, space_dim) = x[0].contiguous(), x.shape[1:]
     ones, kinds = torch.ones_like(places[:, 0]), torch.zeros(count, dtype=torch.int32).to(x.device)
     open_space = torch.zeros(space_dim, dtype=torch.bool, device=x.device)

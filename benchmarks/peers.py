@@ -218,14 +218,14 @@ def main() -> None:
         options = {"repeats": arguments.repeats, "longest": arguments.longest}
         worlds = space_dim, arguments.sizes, device
         rows += peer_rows(arguments.peers, *worlds, left_out, **options)
+        if arguments.output is not None:
+            facts = script_facts(arguments) | {"warp": wp.__version__, "left_out": left_out}
+            record = facts | {"rows": [asdict(row) for row in rows]}
+            write_text(arguments.output, json.dumps(record, indent=1) + "\n")
+        if arguments.plot is not None and rows:
+            write_bytes(arguments.plot, png(draw(rows)))
     print(table_text(rows))
     print("\nleft out:", *(f"  {what}: {why}" for what, why in left_out.items()), sep="\n")
-    if arguments.output is not None:
-        facts = script_facts(arguments) | {"warp": wp.__version__, "left_out": left_out}
-        record = facts | {"rows": [asdict(row) for row in rows]}
-        write_text(arguments.output, json.dumps(record, indent=1) + "\n")
-    if arguments.plot is not None:
-        write_bytes(arguments.plot, png(draw(rows)))
 
 
 if __name__ == "__main__":
