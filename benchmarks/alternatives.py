@@ -1,4 +1,4 @@
-"""The library against other ways to perceive, other precisions and other libraries: time and error.
+"""The library against other ways to perceive and other precisions: time and error.
 
     python benchmarks/alternatives.py --device cuda --output FILE --plot PNG
     python benchmarks/alternatives.py --quick --check benchmarks/results/ratios.json
@@ -12,7 +12,6 @@ stored one.
 
 from __future__ import annotations
 
-import importlib
 import json
 import math
 import sys
@@ -24,13 +23,11 @@ from typing import Any, NamedTuple
 
 import torch
 from drift import drawn_like, relative_error
-from hash_grid import grid_fields
 from precisions import PRECISIONS, Precision
 from scripts import script_facts, script_parser
 from strategies import STRATEGIES, Strategy
 from torch import Tensor
 
-from npa_envs import reference
 from npa_envs.atomic_files import read_json, write_bytes, write_text
 from npa_envs.checks import check_device
 from npa_envs.errors import NPAError, shown
@@ -38,17 +35,14 @@ from npa_envs.measure.plots import new_figure, number_plainly, png
 from npa_envs.measure.quality import psnr
 from npa_envs.measure.speed.suites import BenchReport
 from npa_envs.measure.speed.timing import (
-    NO_TIME,
     Cost,
     Tables,
     Timing,
     TimingSession,
     Workload,
 )
-from npa_envs.ops import perception_fields
 from npa_envs.rule.files import load_rule
 from npa_envs.rule.rule import NPARule
-from npa_envs.runtime import quiet_warp, start_warp
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2D, Morphogenesis2DConfig
 from npa_envs.world.rollout import rollout, step
 
@@ -117,19 +111,17 @@ class Alternatives(TimingSession):
 
 
 def accuracy(session: Alternatives) -> Tables:
-    """Return tables of time and error: of perception, of rollouts, of other libraries."""
+    """Return tables of time and error: of perception and of rollouts."""
     geckos = [1024] if session.small else [1024, 4096]
     flat = Workload(2, 1, 1024, 1)
-    compared = [flat, Workload(3, 1, 512 if session.small else 1024, 1)]
-    worlds = compared
+    worlds = [flat, Workload(3, 1, 512 if session.small else 1024, 1)]
     if not session.small:
         larger = [(2, 1, 4096), (2, 1, 65536 if session.cuda else 16384), (2, 8, 4096)]
-        worlds = [flat, *(Workload(*sizes, 1) for sizes in larger), compared[1]]
+        worlds[1:1] = (Workload(*sizes, 1) for sizes in larger)
         worlds.append(Workload(3, 1, 16384, 1))
     return {
         "perception": [row for world in worlds for row in perception_rows(session, world)],
         "rollouts": [row for count in geckos for row in rollout_rows(session, count)],
-        "peers": [row for world in compared for row in peer_rows(session, world)],
     }
 
 
@@ -460,166 +452,6 @@ def _rollout_row(
         weights=weights,
         psnr_512=None if task is None else task.psnr(),
     )
-
-
-# Other libraries on the same particles. One that is not installed, or breaks, is left out with the
-# reason. Times include the search for neighbours; errors are against `npa_envs.reference`.
-
-OPERATIONS = ("density", "interpolation", "gradient")
-"""rho, smoothed states, and state gradients without correction."""
-
-Fields = dict[str, Tensor]
-"""Results of operations by their names: [N], [N, C], [N, C, D]."""
-
-
-@dataclass(frozen=True)
-class PeerRow:
-    """Time and error of operations of another library on one world, with its search for neighbours.
-
-    The error is relative, the largest where several operations are one call.
-    """
-
-    peer: str
-    operation: str
-    space_dim: int
-    particles: int
-    time_us: Timing
-    error: float
-
-
-@dataclass(frozen=True)
-class Call:
-    """A call that computes some operations; `capturable`: whether a CUDA graph can record it."""
-
-    operation: str
-    run: Callable[[], Fields]
-    capturable: bool = False
-
-
-def peer_rows(session: Alternatives, workload: Workload) -> list[PeerRow]:
-    """Return rows of every other library that is installed, on a workload's first world."""
-    x, s = (tensor[0] for tensor in workload.worlds(session.device))
-    exact = _reference_fields(x.double(), s.double(), workload.eps)
-    rows: list[PeerRow] = []
-    for name, make in PEERS.items():
-        if session.enough():
-            session.left_out[name] = NO_TIME
-            continue
-        try:
-            with quiet_warp():
-                calls = make(x, s, workload.eps)
-                rows += [_row(session, name, call, x, exact) for call in calls]
-        except Exception as error:  # Whatever another library raises is a finding, not ours.
-            session.left_out[name] = f"{type(error).__name__}: {error}"
-        session.progress(1)
-    return rows
-
-
-def _row(session: Alternatives, name: str, call: Call, x: Tensor, exact: Fields) -> PeerRow:
-    errors = [relative_error(value, exact[field]) for field, value in call.run().items()]
-    cost = session.cost(call.run, graph=call.capturable)
-    return PeerRow(name, call.operation, x.shape[1], x.shape[0], cost.time, max(errors))
-
-
-def _reference_fields(x: Tensor, s: Tensor, eps: float) -> Fields:
-    return _named(reference.fields(x[None], s[None], eps))
-
-
-def _named(fields: Any) -> Fields:
-    return dict(zip(OPERATIONS, (fields.rho[0], fields.blur[0], fields.grad0[0]), strict=True))
-
-
-def _library(x: Tensor, s: Tensor, eps: float) -> list[Call]:
-    run = partial(perception_fields, x[None], s[None], eps)
-    return [Call("all", lambda: _named(run()), capturable=True)]
-
-
-def _hash_grid(x: Tensor, s: Tensor, eps: float) -> list[Call]:
-    # Its gradient is corrected by the moment matrix, which the peers' is not.
-    def run() -> Fields:
-        fields = grid_fields(x[None], s[None], eps)
-        return {"density": fields.rho[0], "interpolation": fields.blur[0]}
-
-    return [Call("all", run)]
-
-
-def _dense(x: Tensor, s: Tensor, eps: float) -> list[Call]:
-    return [Call("all", lambda: _reference_fields(x, s, eps))]
-
-
-def _scipy(x: Tensor, s: Tensor, eps: float) -> list[Call]:
-    """Pairs from scipy's k-d tree, sums by torch's index_add; the search is on the CPU."""
-    spatial = importlib.import_module("scipy.spatial")
-
-    def pairs() -> tuple[Tensor, Tensor]:
-        points = x.cpu().numpy()
-        found = spatial.cKDTree(points).query_pairs(eps, output_type="ndarray")
-        one, other = torch.from_numpy(found).to(x.device).unbind(dim=1)
-        itself = torch.arange(len(x), device=x.device)
-        return torch.cat((one, other, itself)), torch.cat((other, one, itself))
-
-    def run() -> Fields:
-        i, j = pairs()
-        r = x[j] - x[i]
-        weight = reference.smoothing_kernel((r * r).sum(dim=-1), eps, x.shape[1])
-        rho = torch.zeros_like(x[:, 0]).index_add(0, i, weight)
-        volume = 1.0 / rho[j]
-        blur = torch.zeros_like(s).index_add(0, i, (volume * weight)[:, None] * s[j])
-        kernel = volume[:, None] * reference.spiky_gradient(r, eps)
-        slopes = (s[j] - s[i])[:, :, None] * kernel[:, None, :]
-        gradient = s.new_zeros(*s.shape, x.shape[1]).index_add(0, i, slopes)
-        return dict(zip(OPERATIONS, (rho, blur, gradient), strict=True))
-
-    return [Call("all", run)]
-
-
-def _warp_sph_core(x: Tensor, s: Tensor, eps: float) -> list[Call]:
-    """warpSPHCore (fluids.dev): one call for each operation, each with a neighbour search."""
-    start_warp()
-    sph = importlib.import_module("warpSPHCore")
-    space_dim = x.shape[1]
-    open_space = torch.zeros(space_dim, dtype=torch.bool, device=x.device)
-    domain = sph.DomainDescription(x.amin(0) - eps, x.amax(0) + eps, open_space, space_dim)
-    radii, masses = torch.full_like(x[:, 0], eps), torch.ones_like(x[:, 0])
-    kinds = torch.zeros(len(x), dtype=torch.int32, device=x.device)
-
-    def call(operation: str, kernel: str, density: Tensor | None, **values: Tensor) -> Tensor:
-        properties = sph.OperationProperties(
-            kernel=sph.KernelFunctions[kernel],
-            operation=sph.WarpOperation[operation],
-            supportMode=sph.SupportScheme.Gather,
-            operationMode=sph.OperationDirection.AllToAll,
-            gradientMode=sph.GradientScheme.Difference,
-        )
-        particles = sph.ParticleState(x, radii, masses, kinds, density)
-        result: Tensor = sph.warpOperation(particles, properties, domain, **values)
-        return result
-
-    def gradient() -> Tensor:
-        found = call("Gradient", "Spiky", rho, **states)
-        # Version 0.6.0 labels 3D gradients [N, C, D] and lays them out as [N, D, C].
-        return found.reshape(len(x), space_dim, -1).mT if space_dim == 3 else found
-
-    rho = call("Density", "Poly6", None)
-    states = {"queryValues": s, "referenceValues": s}
-    return [
-        Call("density", lambda: {"density": call("Density", "Poly6", None)}),
-        Call(
-            "interpolation",
-            lambda: {"interpolation": call("Interpolate", "Poly6", rho, **states)},
-        ),
-        Call("gradient", lambda: {"gradient": gradient()}),
-    ]
-
-
-PEERS = {
-    "npa-envs": _library,
-    "wp.HashGrid": _hash_grid,
-    "dense torch": _dense,
-    "scipy cKDTree + index_add": _scipy,
-    "warpSPHCore": _warp_sph_core,
-}
-"""Other libraries, with the functions that make their calls from x [N, D], s [N, C], eps."""
 
 
 # Plots: fronts of run time against error.

@@ -6,6 +6,8 @@ It shares only the kernel functions W and K with the library's kernels. Its adjo
 
 import contextlib
 import functools
+import math
+from collections.abc import Iterator
 from types import SimpleNamespace
 from typing import Any, NamedTuple
 
@@ -16,9 +18,10 @@ from torch import Tensor
 from npa_envs.kernels.domain import domain_types, make_domain, scalar_name
 from npa_envs.kernels.mathematics import MOMENT_THRESHOLD, smoothing, spiky_factor
 from npa_envs.ops.launch import SCALARS, warp_device
+from npa_envs.runtime import quiet_warp
 
-GRID_CELLS = 128
-"""Buckets of the hash grid along each axis; the third has one in 2D."""
+PER_CELL = 4
+"""Particles in a bucket of the hash grid, on average at most."""
 
 
 class GridFields(NamedTuple):
@@ -57,24 +60,26 @@ class _GridFields(torch.autograd.Function):
         blur, drho = x.new_empty(total, state_dim), x.new_empty(total, space_dim)
         gradient = x.new_empty(total, state_dim, space_dim)
         moment = x.new_empty(total, space_dim, space_dim)
-        with _torch_stream(x.device):
-            grid = _built_grid(points, world, eps, space_dim)
-            ctx.tape, taped = wp.Tape(), ctx.needs_input_grad[1]
+        ctx.tape, taped = wp.Tape(), ctx.needs_input_grad[1]
+        # A tape reads its grid again, which must not have been rebuilt for another world.
+        new_grid = _grid.__wrapped__ if taped else _grid
+        grid = new_grid(x.device, scalar, space_dim, _side(total, space_dim))
+        with _warp_like_torch(x.device):
             states, *sums = (
-                wp.from_torch(tensor.detach(), requires_grad=taped)
-                for tensor in (s.reshape(total, state_dim).contiguous(), blur, gradient)
+                wp.from_torch(tensor.detach().contiguous(), requires_grad=taped)
+                for tensor in (s.reshape(total, state_dim), blur, gradient)
             )
-            vectors, matrices = kernels.vector, kernels.matrix
-            points, world, density = map(
-                _constant, (points, world, rho), (kernels.point, None, None)
-            )
-            others = _constant(moment, matrices), _constant(drho, vectors)
-            given = [domain, scalar(eps), grid.id, points, world, density]
+            places, groups = _constant(points, kernels.point), _constant(world)
+            moments, rises = _constant(moment, kernels.square), _constant(drho, kernels.vector)
+            grid.build(places, eps, groups=groups)
+            given = [domain, scalar(eps), grid.id, places, groups, _constant(rho)]
             where = {"dim": total, "device": warp_device(x.device)}
             wp.launch(kernels.sum_density, inputs=given, **where)
             with ctx.tape if taped else contextlib.nullcontext():
-                wp.launch(kernels.sum_fields, inputs=[*given, states, *sums, *others], **where)
-            wp.launch(kernels.correct, inputs=[others[0], wp.from_torch(gradient)], **where)
+                wp.launch(
+                    kernels.sum_fields, inputs=[*given, states, *sums, moments, rises], **where
+                )
+            wp.launch(kernels.correct, inputs=[moments, _constant(gradient)], **where)
         ctx.arrays, ctx.shape = (states, *sums, grid), s.shape
         shape = (world_count, particle_count)
         fields = (rho, blur, gradient, drho)
@@ -85,7 +90,7 @@ class _GridFields(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, _: Tensor, *bars: Tensor) -> tuple[None, Tensor, None]:
         states, *sums, _grid = ctx.arrays
-        with _torch_stream(bars[0].device):
+        with _warp_like_torch(bars[0].device):
             ctx.tape.zero()
             grads = {
                 array: wp.from_torch(bar.reshape(array.shape).contiguous(), requires_grad=False)
@@ -95,33 +100,33 @@ class _GridFields(torch.autograd.Function):
         return None, wp.to_torch(states.grad).view(ctx.shape), None
 
 
-def _constant(tensor: Tensor, dtype: Any) -> Any:
+def _constant(tensor: Tensor, dtype: Any = None) -> Any:
     """Return a tensor as a Warp array that has no gradient."""
     return wp.from_torch(tensor, dtype=dtype, requires_grad=False)
 
 
-def _torch_stream(device: torch.device) -> contextlib.AbstractContextManager[Any]:
-    """Return a context in which Warp works on torch's current stream."""
-    if device.type != "cuda":
-        return contextlib.nullcontext()
-    current = torch.cuda.current_stream(device)
-    return wp.ScopedStream(wp.stream_from_torch(current))  # type: ignore[no-untyped-call]
+@contextlib.contextmanager
+def _warp_like_torch(device: torch.device) -> Iterator[None]:
+    """Let Warp work on torch's current stream, without messages."""
+    with contextlib.ExitStack() as stack:
+        stack.enter_context(quiet_warp())
+        if device.type == "cuda":
+            current = torch.cuda.current_stream(device)
+            stack.enter_context(wp.ScopedStream(wp.stream_from_torch(current)))
+        yield
+
+
+def _side(total: int, space_dim: int) -> int:
+    """Return the buckets of a hash grid along each axis, a power of two."""
+    return 2 ** math.ceil(math.log2(total / PER_CELL) / space_dim) if total > PER_CELL else 1
 
 
 @functools.cache
-def _grid(device: torch.device, scalar: Any, depth: int) -> Any:
-    """Return the cached hash grid of a kind, which each call rebuilds."""
+def _grid(device: torch.device, scalar: Any, space_dim: int, side: int) -> Any:
+    """Return the cached hash grid of a kind, which each call rebuilds; in 2D it is flat."""
     make: Any = wp.HashGrid
-    return make(GRID_CELLS, GRID_CELLS, depth, device=warp_device(device), dtype=scalar)
-
-
-def _built_grid(points: Tensor, world: Tensor, eps: float, space_dim: int) -> Any:
-    """Return a hash grid of the points, one group for each world."""
-    scalar = SCALARS[points.dtype]
-    grid = _grid(points.device, scalar, GRID_CELLS if space_dim == 3 else 1)
-    array = _constant(points, wp.types.vector(3, scalar))
-    grid.build(array, eps, groups=_constant(world, None))
-    return grid
+    depth = side if space_dim == 3 else 1
+    return make(side, side, depth, device=warp_device(device), dtype=scalar)
 
 
 @functools.cache
@@ -224,5 +229,5 @@ def grid_kernels(space_dim: int, scalar: type, state_dim: int) -> SimpleNamespac
         correct=correct,
         point=point,
         vector=vector,
-        matrix=square,
+        square=square,
     )

@@ -59,6 +59,23 @@ def assemble(s: Tensor, blur: Tensor, gradient: Tensor, drho: Tensor) -> Tensor:
     return torch.cat((s, blur, slopes, reference.log_scale(drho / s.shape[1])), dim=-1)
 
 
+def corrected(gradient: Tensor, moment: Tensor) -> Tensor:
+    """Return state gradients times M^-1 where the library inverts M; not differentiated."""
+    with torch.no_grad():
+        if moment.shape[-1] == 2:
+            adjugate = reference.adjugate(moment)
+        else:
+            a, b, c = moment.unbind(dim=-2)
+            pairs = ((b, c), (c, a), (a, b))
+            adjugate = torch.stack([torch.linalg.cross(*pair) for pair in pairs], dim=-1)
+        determinant = (moment[..., 0, :] * adjugate[..., :, 0]).sum(dim=-1)[..., None, None]
+        inverted = gradient @ (adjugate / determinant)
+        change = torch.where(
+            determinant.abs() >= reference.MOMENT_THRESHOLD, inverted - gradient, 0.0
+        )
+    return gradient + change
+
+
 def nearest(x: Tensor, count: int) -> Tensor:
     """Return the indices of the nearest particles of each, itself included, shape [B, N, K]."""
     found = []
@@ -91,11 +108,7 @@ def capped_perceive(x: Tensor, s: Tensor, eps: float) -> Tensor:
     blur = torch.einsum("bik,bikc->bic", weight * volume, states)
     grad0 = torch.einsum("bik,bikc,bikd->bicd", volume, states - s[:, :, None], kernel)
     moment = torch.einsum("bik,bikd,bike->bide", volume, r, kernel)
-    invertible = torch.linalg.det(moment).abs() >= reference.MOMENT_THRESHOLD
-    unit = torch.eye(x.shape[2], dtype=x.dtype, device=x.device).expand_as(moment)
-    inverse = torch.linalg.inv(torch.where(invertible[..., None, None], moment, unit))
-    gradient = grad0 + (grad0 @ inverse - grad0).detach()
-    return assemble(s, blur, gradient, kernel.sum(dim=2))
+    return assemble(s, blur, corrected(grad0, moment), kernel.sum(dim=2))
 
 
 def from_fields(
@@ -125,12 +138,12 @@ STRATEGIES = {
             differentiable=False,
             capturable=True,
         ),
-        # Two plain Warp kernels over the neighbours of wp.HashGrid.
+        # Plain Warp kernels over the neighbours of wp.HashGrid; their adjoint by wp.Tape.
         Strategy(
             "hash_grid",
             lambda x, s, eps: from_fields(grid_fields, x, s, eps),
             lambda x, s, eps: grid_fields(x, s, eps).rho,
-            differentiable=False,
+            differentiable=True,
             capturable=False,
         ),
         # Torch over all pairs of particles.
