@@ -87,7 +87,7 @@ class Page {
     this.painter = makePainter(this.canvas, new URLSearchParams(location.search).get("painter") ?? "auto");
     this.tracers = new Tracers();
     this.frameTimes = [];
-    this.reported = 0; // when the step was last written
+    this.reported = -Infinity; // when the step was last written
     this.plots = {
       loss: new Plot($("plots"), "Loss", "", { log: true }),
       milliseconds: new Plot($("plots"), "Time of a step", "ms"),
