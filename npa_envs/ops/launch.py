@@ -511,6 +511,11 @@ class _WatchedOperators(TorchDispatchMode):
         self.allocated: set[int] = set()
         """Addresses of the memory."""
 
+    @classmethod
+    def _should_skip_dynamo(cls) -> bool:
+        """Return False, as torch would import its compiler for this mode, which takes seconds."""
+        return False
+
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         """Run an operator of torch."""
         result = func(*args, **(kwargs or {}))

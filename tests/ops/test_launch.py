@@ -1,6 +1,8 @@
 """Launches: tensors of any strides and sizes, one after the other, are described as they are."""
 
 import collections
+import subprocess
+import sys
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest
@@ -88,6 +90,19 @@ def test_repeated_launches_have_the_results_of_the_first(
         assert_same(found, first)
     # With and without gradients, backward and fields, of two sizes; threads have their own.
     assert len(repeats) >= 8
+
+
+LOOP = """
+import sys, torch, npa_envs
+x, s = torch.rand(1, 9, 2), torch.rand(1, 9, 3, requires_grad=True)
+for _ in range(4):
+    npa_envs.perceive(x, s, 0.5).sum().backward()
+print("torch._dynamo" in sys.modules)
+"""
+
+
+def test_a_loop_does_not_wait_for_the_compiler_of_torch_to_be_imported():
+    assert subprocess.check_output([sys.executable, "-c", LOOP], text=True).endswith("False\n")
 
 
 @pytest.mark.usefixtures("nothing_repeated")
