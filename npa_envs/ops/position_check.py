@@ -25,7 +25,6 @@ MAX_NUMBERS = 2**18
 PATIENT_READS, QUERY_INTERVAL = 64, 4096
 """Reads of all reports after which the host lets others run, and asks if the stream has failed."""
 
-
 CHECKS = 100
 """Number of checks of a thread after which devices report the same words again."""
 
