@@ -177,7 +177,7 @@ _RUNS: Mapping[str, Mapping[str, Any]] = {
 
 _SPECIES: Mapping[str, Mapping[str, Any]] = {
     "best": {"cut_share": 0.25, "cut_anywhere": False},
-    "fast": {"hidden_dim": 64, "damage_radius": 0.1, "cut_anywhere": False},
+    "fast": {"hidden_dim": 64},
 }
 """Settings of each species in those measurements."""
 

@@ -514,7 +514,7 @@ _STABILITY: Mapping[str, Any] = {
 
 SPECIES_RUN: Mapping[str, Any] = {
     "optimiser": "adamw", "seed_interval": 1, "max_age_range": (0, 0), "damage_share": 1.0,
-    "stillness_weight": 0.0, "wound_chance": 0.0, "wound_weight": 0.0,
+    "stillness_weight": 0.0,
 }  # fmt: skip
 """Settings of a run of several species: AdamW, an initial world in every batch, which are half of
 batches of two worlds, and no stillness loss (docs/species.md)."""
@@ -537,12 +537,11 @@ MORPHOGENESIS2D_PRESETS = presets_of(
     fast=fast_run(
         task=Morphogenesis2DConfig(
             target_point_count=512, particle_count=512, eps=0.2, seed_radius=0.4, resolution=64,
-            escape_share=1e-3, damage_radius=0.2, cut_anywhere=True, **_STABILITY,
+            escape_share=1e-3, **_STABILITY,
         ),
         iterations=2400, pool_size=32, steps=(16, 32), optimiser="muon", learning_rate=5e-3,
         schedule="cosine", max_age_range=(24, 256), damage_share=0.5, stillness_min_age=64,
-        stillness_weight=2.0, wound_chance=0.2, wound_min_age=64, wound_weight=0.5,
-        picture_interval=200,
+        stillness_weight=2.0, picture_interval=200,
     ),
     tiny=tiny_run(
         task=Morphogenesis2DConfig(
