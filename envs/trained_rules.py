@@ -127,7 +127,7 @@ def run_rule(
     """Return worlds after `steps` of a rule, with options from `config` except for `changes`."""
     names = ("eps", "box", "boundary", "update_prob", "dt", "position_noise")
     constants = {name: getattr(config, name) for name in names} | changes
-    # A world is the same in every batch; on CUDA it is anyway, but for rounding with "whole".
+    # A world is the same in every batch; on CUDA it is anyway.
     alone = particles.x.device.type == "cpu" and not torch.is_grad_enabled()
     constants |= {"generator": random, "world_by_world": alone}
     return rollout_particles(rule, particles, steps, **constants)
