@@ -132,7 +132,7 @@ export class RuleWorld {
 
   // Allocates memory for the present particles, and prepares the weights of the present species.
   prepare() {
-    const kernels = (this.kernels = fastestKernels(padded(this.channels), this.dimension));
+    const kernels = (this.kernels = fastestKernels(padded(this.channels), this.dimension, this.box !== null));
     this.physics = new Physics(this.species.map((rule) => prepareRule(rule, kernels)), this.world.count, kernels);
     this.ruleColours = this.species.map((rule) => new RuleColours(rule, kernels, this.constants.COLOUR_OFFSET));
     this.gpu?.close();
