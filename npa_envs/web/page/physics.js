@@ -252,11 +252,52 @@ export class Physics {
   // eps: perception radius [length units]; box: sides, or null; mask: Uint8Array, 1 where a particle
   // is updated, or null for all; noise: offsets of positions, or null; densityCounts: numbers by which
   // each rule's densities are divided, by default the particles of the world.
-  step(world, { eps, box = null, mask = null, noise = null, densityCounts = null }) {
+  step(world, { eps, box = null, noise = null, ...options }) {
     this.sort(world, eps, box);
-    this.computeDensities(world.count);
-    this.rules.forEach((_, number) => this.advance(world, number, densityCounts?.[number] ?? world.count, mask));
+    this.advancePart(world, options, 0, 1);
     this.finish(world, noise, box);
+  }
+
+  // Advances the particles of one of several parts of a sorted world, without noise: the other ones stay as they are.
+  advancePart(world, { mask = null, densityCounts = null }, part, parts) {
+    const [first, end] = this.cellsOf(world.count, part, parts);
+    const total = this.cellCount, reach = 3 * (total / this.cells[this.dimension - 1]);
+    const some = end - first + 2 * reach < total;
+    this.computeDensities(world.count, some ? first - reach + total : 0, some ? end - first + 2 * reach : total);
+    for (let number = 0; number < this.rules.length; number++) {
+      this.advance(world, number, densityCounts?.[number] ?? world.count, mask, first, end);
+    }
+  }
+
+  // The first cell of a part, and the one after its last: parts have about as many particles.
+  cellsOf(count, part, parts) {
+    return [part, part + 1].map((number) => {
+      let low = 0, high = this.cellCount;
+      while (low < high) {
+        const middle = (low + high) >> 1;
+        if (this.starts[middle] * parts < count * number) low = middle + 1;
+        else high = middle;
+      }
+      return low;
+    });
+  }
+
+  // Returns x and s of the particles of a part, one after the other; or writes those that are given to the world.
+  exchange({ count, x, s }, part, parts, given = null) {
+    const { dimension, channels, order, starts } = this, [from, to] = this.cellsOf(count, part, parts).map((cell) => starts[cell]);
+    const values = given ?? new Float32Array((to - from) * (dimension + channels));
+    let at = 0;
+    const copy = (array, first, end) => {
+      for (let k = first; k < end; k++, at++) {
+        if (given === null) values[at] = array[k];
+        else array[k] = values[at];
+      }
+    };
+    for (let k = from; k < to; k++) {
+      copy(x, order[k] * dimension, (order[k] + 1) * dimension);
+      copy(s, order[k] * channels, (order[k] + 1) * channels);
+    }
+    return values;
   }
 
   // Adds noise and moves particles back into the box.
@@ -317,15 +358,15 @@ export class Physics {
     this.halfSides = this.perSide.map((per) => 0.5 / per);
     this.constants.set([eps, eps * eps, this.weight, this.slope, ...this.sides, ...this.perSide]);
     this.cells = cells;
+    this.cellCount = cells[0] * cells[1] * cells[2];
     return inverse;
   }
 
   // Writes particles' indices, sorted by cell, to `order`, and where each cell's particles begin to `starts`.
   orderByCell(x, count, inverse) {
-    const { dimension, order, cellOf, cells } = this;
+    const { dimension, order, cellOf, cells, cellCount: total } = this;
     const three = dimension === 3;
-    const [nx, ny, nz] = cells;
-    const total = nx * ny * nz;
+    const [nx, ny] = cells;
     if (this.starts.length < total + 1) this.starts = new Int32Array(total + 1);
     const starts = this.starts.fill(0, 0, total + 1);
     const cellAlong = (position, d) => {
@@ -378,13 +419,14 @@ export class Physics {
     this.rangesEnd = used;
   }
 
-  computeDensities(count) {
+  // Computes the densities in some cells, in all by default: `cells` from `first` on, after the last one the first one.
+  computeDensities(count, first = 0, cells = this.cellCount) {
     const { density, gradient, starts, points: { volume } } = this;
     for (const axis of gradient) axis.fill(0, 0, count);
     // The particle itself.
     density.fill(this.weight * this.eps ** 6, 0, count);
-    const total = this.cells[0] * this.cells[1] * this.cells[2];
-    for (let cell = 0; cell < total; cell++) {
+    for (let n = 0; n < cells; n++) {
+      const cell = (first + n) % this.cellCount;
       if (starts[cell] === starts[cell + 1]) continue;
       this.rangesAround(cell);
       this.kernels.sumDensities(this, starts[cell], starts[cell + 1]);
@@ -392,11 +434,10 @@ export class Physics {
     for (let i = 0; i < count; i++) volume[i] = 1 / density[i];
   }
 
-  // Perceives the active particles of one rule, runs its network, and updates them.
-  advance(world, number, densityCount, mask) {
+  // Perceives the active particles of one rule in the cells [first, end), runs its network, and updates them.
+  advance(world, number, densityCount, mask, first, end) {
     const { order, starts, blockRows, kernels, rows, rowWidth, hidden, updates } = this;
     const rule = this.rules[number];
-    const total = this.cells[0] * this.cells[1] * this.cells[2];
     let filled = 0;
     const flush = () => {
       if (filled === 0) return;
@@ -407,7 +448,7 @@ export class Physics {
       }
       filled = 0;
     };
-    for (let cell = 0; cell < total; cell++) {
+    for (let cell = first; cell < end; cell++) {
       let found = false;
       for (let i = starts[cell]; i < starts[cell + 1]; i++) {
         const particle = order[i];

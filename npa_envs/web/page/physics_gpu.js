@@ -223,7 +223,7 @@ export class GpuPhysics {
   async step(world, { eps, box = null, mask = null, noise = null, densityCounts = null }) {
     const { physics, device, chosen } = this, { count, x, s, species } = world;
     physics.orderByCell(x, count, physics.setGrid(x, count, eps, box));
-    const { order, cellOf, starts, cells, capacity } = physics;
+    const { order, cellOf, starts, cellCount, capacity } = physics;
     const write = (buffer, array, length, at = 0) => device.queue.writeBuffer(buffer, 4 * at, array, 0, length);
     const encoder = device.createCommandEncoder();
     const pass = encoder.beginComputePass();
@@ -245,7 +245,7 @@ export class GpuPhysics {
     pass.end();
     write(this.x, x, x.length);
     write(this.s, s, s.length);
-    const parts = [[order, count], [cellOf, count], [chosen, rows], [starts, cells[0] * cells[1] * cells[2] + 1]];
+    const parts = [[order, count], [cellOf, count], [chosen, rows], [starts, cellCount + 1]];
     parts.forEach(([array, length], part) => write(this.indices, array, length, part * capacity));
     encoder.copyBufferToBuffer(this.x, 0, this.mapped, 0, x.byteLength);
     encoder.copyBufferToBuffer(this.s, 0, this.mapped, x.byteLength, s.byteLength);
