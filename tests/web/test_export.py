@@ -130,6 +130,11 @@ def test_helpers_change_no_bit_of_a_world(run, crowds, rule):
     assert all(one[field] == runs[0][field] for one in runs for field in ("x", "s", "errors"))
 
 
+def test_a_page_may_have_as_many_particles_as_it_was_asked_for():
+    world = page_rule("gecko", particle_count=20_000)["world"]
+    assert world["count"] == world["settings"]["count"]["high"] == 20_000
+
+
 PAUSE = {"type": "play", "on": False}
 BRUSHES = {
     "wipe": {}, "remove": {}, "clump": {},

@@ -3,7 +3,7 @@
 // return the bytes of instructions (the assembler below), and `assemble` joins the kernels. So no compiler is needed,
 // and sizes are constants in the code. Instructions and format: https://webassembly.github.io/spec/core/binary/.
 
-import { padded, plainKernels, range, TILE_OUTPUTS, tiledLayer } from "./physics.js";
+import { padded, plainKernels, numbersBelow, TILE_OUTPUTS, tiledLayer } from "./physics.js";
 
 const MEMORY_PAGES = 512;
 const PAGE_BYTES = 65536;
@@ -97,7 +97,7 @@ function makeLocals() {
 
 // Writes the sum of the four lanes of `local` to an address.
 function storeSum(at, local, offset = 0) {
-  const turned = (by) => i8x16.shuffle(local.get, range(16).map((k) => (k + by) % 16));
+  const turned = (by) => i8x16.shuffle(local.get, numbersBelow(16).map((k) => (k + by) % 16));
   return [8, 4].flatMap((by) => local.set(f32x4.add(local.get, turned(by))))
     .concat(v128.store32_lane(at, local.get, offset));
 }
@@ -107,7 +107,7 @@ function storeSum(at, local, offset = 0) {
 // each, `d` is the vector to them, `squared` its square, and `factor` the spiky kernel over the distance, 0 for itself.
 function makeVisits({ integers, vectors }, { dimension, periodic }, constantsAt, positions, ranges, rangesEnd) {
   const [byte, end, hits, at] = integers(4);
-  const axes = range(dimension);
+  const axes = numbersBelow(dimension);
   const [lanes, squared, inside, distance, factor, left, smooth] = vectors(7), [d, own] = [vectors(3), vectors(3)];
   const constants = vectors(10), [eps, square, weight, slope] = constants, [sides, perSide] = [constants.slice(4), constants.slice(7)];
   const toNearest = (a) => f32x4.mul(sides[a].get, f32x4.nearest(f32x4.mul(d[a].get, perSide[a].get)));
@@ -176,7 +176,7 @@ function sumDensitiesCode(space, madd) {
 function sumNeighboursCode(width, dimension, madd) {
   const { counts, parameters, integers, vectors } = makeLocals();
   const [states, own, listBytes, stateAt] = parameters(4), lists = parameters(4), [row, inverse] = parameters(2);
-  const [done, at] = integers(2), axes = range(dimension);
+  const [done, at] = integers(2), axes = numbersBelow(dimension);
   const [other, offset] = vectors(2), factors = vectors(4), mine = vectors(2), entries = vectors(6), scaled = vectors(3);
   const matrix = [[0, 1, 2], [1, 3, 4], [2, 4, 5]].map((line) => line.map((k) => entries[k]));
   const [length, mantissa, exponent, ratio, square] = vectors(5);
@@ -280,7 +280,7 @@ function applyLayerCode(madd) {
   ];
   const inner = [
     ...at.flatMap((each, k) => each.set(i32.add(row.get, i32.add(i32.mul(rowBytes.get, i32.const(k)), input.get)))),
-    ...range(4).flatMap((p) => [
+    ...numbersBelow(4).flatMap((p) => [
       ...left.set(v128.load(weight.get, 4 * TILE_OUTPUTS * p)), ...right.set(v128.load(weight.get, 4 * TILE_OUTPUTS * p + 16)),
       ...sums.flatMap(([leftSum, rightSum], k) => [
         ...spread.set(v128.load32_splat(at[k].get, 4 * p)), ...addProduct(leftSum, left), ...addProduct(rightSum, right),

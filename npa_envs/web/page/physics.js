@@ -31,7 +31,7 @@ export function padded(channels) {
   return LANES * Math.ceil(channels / LANES);
 }
 
-export function range(count) {
+export function numbersBelow(count) {
   return [...new Array(count).keys()];
 }
 
@@ -43,9 +43,9 @@ export function prepareRule(description, kernels) {
   // density's slopes and, as the last number, 1. `columns` are their places in the order of NPARule's perception.
   const width = padded(channels);
   rule.inputs = (2 + dimension) * width + LANES;
-  const columns = [0, 1].flatMap((part) => range(channels).map((c) => part * width + c));
-  if (rule.state_gradient) columns.push(...range(channels * dimension).map((p) => (2 + p % dimension) * width + Math.floor(p / dimension)));
-  if (rule.density_gradient) columns.push(...range(dimension).map((d) => rule.inputs - LANES + d));
+  const columns = [0, 1].flatMap((part) => numbersBelow(channels).map((c) => part * width + c));
+  if (rule.state_gradient) columns.push(...numbersBelow(channels * dimension).map((p) => (2 + p % dimension) * width + Math.floor(p / dimension)));
+  if (rule.density_gradient) columns.push(...numbersBelow(dimension).map((d) => rule.inputs - LANES + d));
   // W with these columns, and b as the last one: [hidden, inputs].
   rule.matrix = new Float32Array(hidden * rule.inputs);
   for (let h = 0; h < hidden; h++) {

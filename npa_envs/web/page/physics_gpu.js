@@ -1,7 +1,7 @@
 // The step of physics.js on the GPU, through WebGPU. The CPU only counts which particles each cell has, and chooses
 // active ones. The head of physics.js says which formulas are here as well.
 
-import { CELLS_PER_RADIUS, MAX_CELLS, MOMENT_THRESHOLD, range, SQUARED_MOMENT_SOFTENING } from "./physics.js";
+import { CELLS_PER_RADIUS, MAX_CELLS, MOMENT_THRESHOLD, numbersBelow, SQUARED_MOMENT_SOFTENING } from "./physics.js";
 
 const GROUP = 64;
 const UNIFORM_BYTES = 96;
@@ -15,7 +15,7 @@ export async function openDevice() {
 
 // The shaders are WGSL. Loops over quads, four numbers at a time, are written out, so that their variables stay in
 // registers.
-const each = (count, text) => range(count).map(text).join("\n    ");
+const each = (count, text) => numbersBelow(count).map(text).join("\n    ");
 
 // Runs `body`, WGSL that may read j, d, w and spike, for all neighbours j of sorted particle k, itself included: the
 // vector d to it, the smoothing kernel w there, and `spike`, where spike d is the spiky kernel's gradient. Cells of a row
@@ -105,7 +105,7 @@ export function shaders({ state_dim: channels, space_dim: dimension, inputs, hid
     let i = indices[k];
     let p = vec3f(${["x", "y", "z"].map((_, d) => (d < dimension ? `x[i * ${dimension} + ${d}]` : "0.0"))});
     points[k] = vec4f(p - world.sides.xyz * floor(p * world.per.xyz + 0.5), 0.0);
-    ${each(quads, (q) => `states[k * ${quads} + ${q}] = vec4f(${range(4).map((n) => state(4 * q + n))});`)}
+    ${each(quads, (q) => `states[k * ${quads} + ${q}] = vec4f(${numbersBelow(4).map((n) => state(4 * q + n))});`)}
   }
 
   @compute @workgroup_size(${GROUP})
@@ -158,7 +158,7 @@ export function shaders({ state_dim: channels, space_dim: dimension, inputs, hid
       ${each(outputQuads, (q) => `y${q} += sum * weights[at + ${inputQuads + q}];`)}
     }
     ${each(outputQuads, (q) => `y${q} = select(y${q}, vec4f(0.0), abs(y${q}) <= vec4f(world.deadZone));`)}
-    ${moved ? `let reach = world.reach / (1.0 + sqrt(${range(moved).map((d) => `${update(d)} * ${update(d)}`).join(" + ")}));` : ""}
+    ${moved ? `let reach = world.reach / (1.0 + sqrt(${numbersBelow(moved).map((d) => `${update(d)} * ${update(d)}`).join(" + ")}));` : ""}
     ${each(moved, (d) => `x[i * ${dimension} + ${d}] += reach * ${update(d)};`)}
     ${each(channels, (c) => `${state(c)} += ${update(moved + c)};`)}
   }`;

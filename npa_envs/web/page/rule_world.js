@@ -4,14 +4,16 @@
 import { clump, cut, cutAlong, wipeState, inject, insideBall, push, scatter, stateAround } from "./brushes.js";
 import { Colouring, RuleColours } from "./colours.js";
 import { fastestKernels } from "./kernels_simd.js";
-import { padded, Physics, prepareRule, wrap } from "./physics.js";
+import { padded, Physics, prepareRule, numbersBelow, wrap } from "./physics.js";
 import { GpuPhysics, openDevice } from "./physics_gpu.js";
 
 // Maximum number of frames that the page has not drawn yet: the world waits for a slow or hidden page.
 const FRAMES_AHEAD = 2;
 
-// The number of steps in which the GPU is compared with the CPU, and the largest difference of right results.
+// The number of steps in which the GPU is compared with the CPU, how many times as fast it needs no more of them, and the
+// largest difference of right results.
 const TRIAL_STEPS = 4;
+const CLEARLY_FASTER = 4;
 const TRIAL_TOLERANCE = 1e-3;
 
 // What brushes do, by the names of `BRUSHES` of npa_envs/web/messages.py: functions of a RuleWorld and a message
@@ -70,6 +72,17 @@ const DAMAGES = {
 const MIN_SHARED = 2048;
 const MAX_HELPERS = 3;
 
+// Starts helpers that run `code`; none without it, or where the browser does not let a worker start others.
+function startHelpers(code) {
+  if (!code) return [];
+  try {
+    const address = URL.createObjectURL(new Blob([code], { type: "text/javascript" }));
+    return numbersBelow(Math.max(0, Math.min(MAX_HELPERS, (navigator.hardwareConcurrency >> 1) - 1))).map(() => new Worker(address));
+  } catch {
+    return [];
+  }
+}
+
 // Physics of rules with weights prepared, by the fastest kernels.
 function makePhysics(rules, capacity, periodic) {
   const kernels = fastestKernels(padded(rules[0].state_dim), rules[0].space_dim, periodic);
@@ -87,9 +100,7 @@ export class RuleWorld {
     this.colourTables = mapped(settings.colours, bytesOf);
     this.constants = settings.constants;
     this.send = send;
-    const count = settings.code ? Math.min(MAX_HELPERS, (navigator.hardwareConcurrency >> 1) - 1) : 0;
-    const address = count > 0 && URL.createObjectURL(new Blob([settings.code], { type: "text/javascript" }));
-    this.helpers = Array.from({ length: count }, () => new Worker(address));
+    this.helpers = startHelpers(settings.code);
     this.playing = true;
     this.changed = false;
     this.undrawn = 0;
@@ -174,7 +185,7 @@ export class RuleWorld {
     const agrees = await this.gpu.step(other, options).then(() => alike(world, other), () => false);
     trial.cpu = Math.min(trial.cpu, between - started);
     trial.gpu = Math.min(trial.gpu, performance.now() - between);
-    trial.left--;
+    trial.left = trial.cpu > CLEARLY_FASTER * trial.gpu ? 0 : trial.left - 1;
     if (!agrees || (trial.left === 0 && trial.gpu > trial.cpu)) this.leaveGpu();
   }
 
