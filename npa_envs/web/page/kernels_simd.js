@@ -3,7 +3,7 @@
 // return the bytes of instructions (the assembler below), and `assemble` joins the kernels. So no compiler is needed,
 // and sizes are constants in the code. Instructions and format: https://webassembly.github.io/spec/core/binary/.
 
-import { padded, plainKernels, numbersBelow, TILE_OUTPUTS, tiledLayer } from "./physics.js";
+import { numbersBelow, padded, plainKernels, TILE_OUTPUTS, tiledLayer } from "./physics.js";
 
 const MEMORY_PAGES = 512;
 const PAGE_BYTES = 65536;
@@ -60,10 +60,12 @@ const f32x4 = {
 };
 const i32x4 = {
   splat: unary(...vector(0x11)), lt_s: binary(...vector(0x39)), bitmask: unary(...vector(0xa4)),
-  shl: binary(...vector(0xab)), shr_s: binary(...vector(0xac)), add: binary(...vector(0xae)), sub: binary(...vector(0xb1)),
-  mul: binary(...vector(0xb5)),
+  shl: binary(...vector(0xab)), shr_s: binary(...vector(0xac)),
+  add: binary(...vector(0xae)), sub: binary(...vector(0xb1)), mul: binary(...vector(0xb5)),
 };
-const i8x16 = { swizzle: binary(...vector(0x0e)), shuffle: (value, bytes) => [...value, ...value, ...vector(0x0d, ...bytes)] };
+const i8x16 = {
+  swizzle: binary(...vector(0x0e)), shuffle: (value, bytes) => [...value, ...value, ...vector(0x0d, ...bytes)],
+};
 // a b + c, in one instruction where the browser has it, which rounds once.
 const products = [
   (a, b, c) => f32x4.add(f32x4.mul(a, b), c),
@@ -92,7 +94,8 @@ function makeLocals() {
     });
   };
   const runOf = (type) => makerOf((count) => counts.runs.push([...unsigned(count), type]));
-  return { counts, parameters: makerOf((count) => (counts.parameters += count)), integers: runOf(INTEGER), vectors: runOf(VECTOR) };
+  const parameters = makerOf((count) => (counts.parameters += count));
+  return { counts, parameters, integers: runOf(INTEGER), vectors: runOf(VECTOR) };
 }
 
 // Writes the sum of the four lanes of `local` to an address.
@@ -109,7 +112,8 @@ function makeVisits({ integers, vectors }, { dimension, periodic }, constantsAt,
   const [byte, end, hits, at] = integers(4);
   const axes = numbersBelow(dimension);
   const [lanes, squared, inside, distance, factor, left, smooth] = vectors(7), [d, own] = [vectors(3), vectors(3)];
-  const constants = vectors(10), [eps, square, weight, slope] = constants, [sides, perSide] = [constants.slice(4), constants.slice(7)];
+  const constants = vectors(10), [eps, square, weight, slope] = constants;
+  const sides = constants.slice(4), perSide = constants.slice(7);
   const toNearest = (a) => f32x4.mul(sides[a].get, f32x4.nearest(f32x4.mul(d[a].get, perSide[a].get)));
   const kernels = [
     ...distance.set(f32x4.sqrt(squared.get)),
@@ -154,7 +158,8 @@ function sumDensitiesCode(space, madd) {
   const { counts, parameters, ...makers } = makeLocals();
   const [constants] = parameters(1), positions = parameters(3), outputs = parameters(4);
   const [own, ownEnd, ranges, rangesEnd] = parameters(4);
-  const { begin, visit, d, inside, factor, smooth, axes } = makeVisits(makers, space, constants, positions, ranges, rangesEnd);
+  const visits = makeVisits(makers, space, constants, positions, ranges, rangesEnd);
+  const { begin, visit, d, inside, factor, smooth, axes } = visits;
   const sums = makers.vectors(1 + space.dimension);
   const code = [
     ...begin,
@@ -171,8 +176,8 @@ function sumDensitiesCode(space, madd) {
   return { ...counts, code };
 }
 
-// sumNeighbours(states, own, listBytes, stateAt, smoothing, slopeX, slopeY, slopeZ, row, inverse): addresses in bytes; `own`
-// is that of the particle's state.
+// sumNeighbours(states, own, listBytes, stateAt, smoothing, slopeX, slopeY, slopeZ, row, inverse): addresses in bytes;
+// `own` is that of the particle's state.
 function sumNeighboursCode(width, dimension, madd) {
   const { counts, parameters, integers, vectors } = makeLocals();
   const [states, own, listBytes, stateAt] = parameters(4), lists = parameters(4), [row, inverse] = parameters(2);
@@ -183,7 +188,8 @@ function sumNeighboursCode(width, dimension, madd) {
   // The sums of each list, each of two vectors; in 2D the last list is not used.
   const listSums = lists.map(() => vectors(2)).slice(0, dimension + 1);
   const addProduct = (sum, factor, term) => sum.set(madd(factor.get, term.get, sum.get));
-  const sumOf = (pairs) => pairs.slice(1).reduce((sum, [a, b]) => madd(a.get, b.get, sum), f32x4.mul(pairs[0][0].get, pairs[0][1].get));
+  const sumOf = ([[first, second], ...pairs]) =>
+    pairs.reduce((sum, [a, b]) => madd(a.get, b.get, sum), f32x4.mul(first.get, second.get));
   const one = f32x4.splat(1), lowest = i32x4.splat(i32.const(0x3f3504f3)); // the bits of √½
   // log m = 2 (t + t³ / 3 + t⁵ / 5 + ...) with t = (m - 1) / (m + 1), for m in [√½, √2).
   const series = [1 / 9, 1 / 7, 1 / 5, 1 / 3, 1].map(f32x4.splat).reduce((sum, term) => madd(sum, square.get, term));
@@ -238,10 +244,11 @@ function sumNeighboursCode(width, dimension, madd) {
 // neighbours and the moment matrix.
 function listNeighboursCode(space, madd) {
   const { counts, parameters, ...makers } = makeLocals();
-  const [constants, order] = parameters(2), positions = parameters(3), [volume, own, ranges, rangesEnd, width] = parameters(5);
+  const [constants, order] = parameters(2), positions = parameters(3);
+  const [volume, own, ranges, rangesEnd, width] = parameters(5);
   const [stateAt, smoothing] = parameters(2), slopes = parameters(3), [out] = parameters(1);
-  const scan = makeVisits(makers, space, constants, positions, ranges, rangesEnd);
-  const { begin, visit, d, hits, factor, smooth, byte, lanes, axes } = scan;
+  const visits = makeVisits(makers, space, constants, positions, ranges, rangesEnd);
+  const { begin, visit, d, hits, factor, smooth, byte, lanes, axes } = visits;
   const [count, at] = makers.integers(2), [front, volumes] = makers.vectors(2), scaled = makers.vectors(3);
   const moment = [makers.vectors(3), makers.vectors(2), makers.vectors(1)]; // the upper triangle, row by row
   const append = (list, code) => v128.store(i32.add(list.get, at.get), i8x16.swizzle(code, front.get));
@@ -281,7 +288,8 @@ function applyLayerCode(madd) {
   const inner = [
     ...at.flatMap((each, k) => each.set(i32.add(row.get, i32.add(i32.mul(rowBytes.get, i32.const(k)), input.get)))),
     ...numbersBelow(4).flatMap((p) => [
-      ...left.set(v128.load(weight.get, 4 * TILE_OUTPUTS * p)), ...right.set(v128.load(weight.get, 4 * TILE_OUTPUTS * p + 16)),
+      ...left.set(v128.load(weight.get, 4 * TILE_OUTPUTS * p)),
+      ...right.set(v128.load(weight.get, 4 * TILE_OUTPUTS * p + 16)),
       ...sums.flatMap(([leftSum, rightSum], k) => [
         ...spread.set(v128.load32_splat(at[k].get, 4 * p)), ...addProduct(leftSum, left), ...addProduct(rightSum, right),
       ]),
@@ -377,8 +385,9 @@ export function simdKernels(width, dimension, periodic = true) {
 
   function sumDensities({ constants, points: { x, y, z }, density, gradient, ranges, rangesEnd }, first, end) {
     run.sumDensities(
-      constants.byteOffset, x.byteOffset, y.byteOffset, z.byteOffset, density.byteOffset, gradient[0].byteOffset,
-      gradient[1].byteOffset, gradient[2].byteOffset, 4 * first, 4 * end, ranges.byteOffset, ranges.byteOffset + 4 * rangesEnd,
+      constants.byteOffset, x.byteOffset, y.byteOffset, z.byteOffset, density.byteOffset,
+      gradient[0].byteOffset, gradient[1].byteOffset, gradient[2].byteOffset, 4 * first, 4 * end,
+      ranges.byteOffset, ranges.byteOffset + 4 * rangesEnd,
     );
   }
 

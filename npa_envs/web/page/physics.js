@@ -5,7 +5,7 @@
 //   density                sumDensities         sumDensitiesCode      density
 //   list of neighbours     listNeighbours       listNeighboursCode    visitNeighbours
 //   sums over neighbours   sumNeighbours        sumNeighboursCode     advance
-//   perception             perceive, logScaled   sumNeighboursCode    advance
+//   perception             perceive, logScaled  sumNeighboursCode     advance
 //   network                applyLayer           applyLayerCode        advance
 //   new positions, states  update                                     advance
 //
@@ -41,15 +41,16 @@ export function prepareRule(description, kernels) {
   const { weights, hidden_dim: hidden, state_dim: channels, space_dim: dimension } = rule;
   // Perception vectors are rows of padded parts: the state, the smoothed state, its slopes along each axis; then the
   // density's slopes and, as the last number, 1. `columns` are their places in the order of NPARule's perception.
-  const width = padded(channels);
+  const width = padded(channels), matrix = weights["hidden.weight"];
   rule.inputs = (2 + dimension) * width + LANES;
   const columns = [0, 1].flatMap((part) => numbersBelow(channels).map((c) => part * width + c));
-  if (rule.state_gradient) columns.push(...numbersBelow(channels * dimension).map((p) => (2 + p % dimension) * width + Math.floor(p / dimension)));
+  const slopeAt = (p) => (2 + p % dimension) * width + Math.floor(p / dimension);
+  if (rule.state_gradient) columns.push(...numbersBelow(channels * dimension).map(slopeAt));
   if (rule.density_gradient) columns.push(...numbersBelow(dimension).map((d) => rule.inputs - LANES + d));
   // W with these columns, and b as the last one: [hidden, inputs].
   rule.matrix = new Float32Array(hidden * rule.inputs);
   for (let h = 0; h < hidden; h++) {
-    columns.forEach((column, p) => (rule.matrix[h * rule.inputs + column] = weights["hidden.weight"][h * columns.length + p]));
+    columns.forEach((column, p) => (rule.matrix[h * rule.inputs + column] = matrix[h * columns.length + p]));
     rule.matrix[(h + 1) * rule.inputs - 1] = weights["hidden.bias"][h];
   }
   rule.outputs = channels + (rule.static ? 0 : rule.space_dim);
@@ -284,7 +285,8 @@ export class Physics {
 
   // Returns x and s of the particles of a part, one after the other; or writes those that are given to the world.
   exchange({ count, x, s }, part, parts, given = null) {
-    const { dimension, channels, order, starts } = this, [from, to] = this.cellsOf(count, part, parts).map((cell) => starts[cell]);
+    const { dimension, channels, order } = this;
+    const [from, to] = this.cellsOf(count, part, parts).map((cell) => this.starts[cell]);
     const values = given ?? new Float32Array((to - from) * (dimension + channels));
     let at = 0;
     const copy = (array, first, end) => {
@@ -314,7 +316,8 @@ export class Physics {
     this.orderByCell(x, count, inverse);
     const { dimension, channels, width, order, points } = this;
     // Integers of the same bits are copied without conversions.
-    const [to, from] = [this.states, s].map(({ buffer, byteOffset, length }) => new Int32Array(buffer, byteOffset, length));
+    const bitsOf = ({ buffer, byteOffset, length }) => new Int32Array(buffer, byteOffset, length);
+    const to = bitsOf(this.states), from = bitsOf(s);
     const [sideX, sideY, sideZ] = this.sides;
     const inBox = (position, side) => (side > 0 ? position - side * Math.floor(position / side + 0.5) : position);
     for (let k = 0; k < count; k++) {
@@ -370,10 +373,12 @@ export class Physics {
     if (this.starts.length < total + 1) this.starts = new Int32Array(total + 1);
     const starts = this.starts.fill(0, 0, total + 1);
     const cellAlong = (position, d) => {
-      const scaled = position * inverse[d];
-      // Integers, whose remainders are fast, where they suffice.
-      const cell = (Math.abs(scaled) < 1e9 ? Math.floor(scaled) | 0 : Math.floor(scaled)) % cells[d];
-      return cell < 0 ? cell + cells[d] : cell | 0;
+      const along = cells[d];
+      let cell = Math.floor(position * inverse[d]);
+      if (cell < 0) cell += along;
+      // Remainders are slow, and needed by far particles only.
+      if (!(cell >= 0 && cell < along)) cell = ((cell % along) + along) % along;
+      return cell | 0;
     };
     for (let i = 0; i < count; i++) {
       const at = i * dimension;

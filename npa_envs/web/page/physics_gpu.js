@@ -27,7 +27,8 @@ function visitNeighbours(body) {
     let at = vec3u(cell % world.cells.x, (cell / world.cells.x) % world.cells.y, cell / (world.cells.x * world.cells.y));
     let counts = min(world.cells.xyz, vec3u(${SPAN}));
     // In a small box each cell is visited once.
-    let first = select((at + world.cells.xyz - vec3u(${CELLS_PER_RADIUS})) % world.cells.xyz, vec3u(0), counts < vec3u(${SPAN}));
+    let around = (at + world.cells.xyz - vec3u(${CELLS_PER_RADIUS})) % world.cells.xyz;
+    let first = select(around, vec3u(0), counts < vec3u(${SPAN}));
     let before = min(counts.x, world.cells.x - first.x);
     for (var cz = 0u; cz < counts.z; cz++) {
       for (var cy = 0u; cy < counts.y; cy++) {
@@ -66,7 +67,7 @@ const INVERSES = {
   threshold: `if (abs(determinant) >= ${MOMENT_THRESHOLD}) { ${each(6, (n) => `m[${n}] = adjugate[${n}] / determinant;`)} }`,
 };
 
-// The shaders of one rule, in the order in which they run: sizes are constants in them. `place` sorts copies of particles.
+// The shaders of one rule, in the order in which they run: `place` sorts copies of particles. Sizes are constants in them.
 const SHADERS = ["place", "density", "advance"];
 
 export function shaders({ state_dim: channels, space_dim: dimension, inputs, hidden_dim: hidden, outputs, ...rule }) {
@@ -158,7 +159,7 @@ export function shaders({ state_dim: channels, space_dim: dimension, inputs, hid
       ${each(outputQuads, (q) => `y${q} += sum * weights[at + ${inputQuads + q}];`)}
     }
     ${each(outputQuads, (q) => `y${q} = select(y${q}, vec4f(0.0), abs(y${q}) <= vec4f(world.deadZone));`)}
-    ${moved ? `let reach = world.reach / (1.0 + sqrt(${numbersBelow(moved).map((d) => `${update(d)} * ${update(d)}`).join(" + ")}));` : ""}
+    let reach = world.reach / (1.0 + sqrt(0.0${numbersBelow(moved).map((d) => ` + ${update(d)} * ${update(d)}`).join("")}));
     ${each(moved, (d) => `x[i * ${dimension} + ${d}] += reach * ${update(d)};`)}
     ${each(channels, (c) => `${state(c)} += ${update(moved + c)};`)}
   }`;
@@ -201,7 +202,7 @@ export class GpuPhysics {
     this.indices = buffer(4 * (3 * capacity + MAX_CELLS[dimension] ** dimension + 1), STORAGE | COPY_DST);
     this.mapped = buffer(4 * (dimension + channels) * capacity, MAP_READ | COPY_DST);
     const sorted = [16, 4 * width, 16].map((bytes) => buffer(bytes * capacity, STORAGE));
-    const types = ["uniform", "storage", "storage", "read-only-storage", "storage", "storage", "storage", "read-only-storage"];
+    const read = "read-only-storage", types = ["uniform", "storage", "storage", read, "storage", "storage", "storage", read];
     const entry = (type, binding) => ({ binding, visibility: GPUShaderStage.COMPUTE, buffer: { type } });
     const layout = device.createBindGroupLayout({ entries: types.map(entry) });
     const pipelines = device.createPipelineLayout({ bindGroupLayouts: [layout] });
@@ -214,7 +215,8 @@ export class GpuPhysics {
       const group = device.createBindGroup({
         layout, entries: buffers.map((each, binding) => ({ binding, resource: { buffer: each } })),
       });
-      const stages = SHADERS.map((entryPoint) => device.createComputePipeline({ layout: pipelines, compute: { module, entryPoint } }));
+      const pipeline = (entryPoint) => device.createComputePipeline({ layout: pipelines, compute: { module, entryPoint } });
+      const stages = SHADERS.map(pipeline);
       return { rule, world, group, stages };
     });
     this.chosen = new Uint32Array(capacity);
@@ -264,7 +266,8 @@ export class GpuPhysics {
   }
 }
 
-function uniforms({ sides, perSide, cells, dimension, eps, weight, slope, capacity }, rule, count, firstRow, rows, densityCount) {
+function uniforms(physics, rule, count, firstRow, rows, densityCount) {
+  const { sides, perSide, cells, dimension, eps, weight, slope, capacity } = physics;
   const bytes = new ArrayBuffer(UNIFORM_BYTES);
   const floats = new Float32Array(bytes), integers = new Uint32Array(bytes);
   floats.set(sides);

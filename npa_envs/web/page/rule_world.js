@@ -4,7 +4,7 @@
 import { clump, cut, cutAlong, wipeState, inject, insideBall, push, scatter, stateAround } from "./brushes.js";
 import { Colouring, RuleColours } from "./colours.js";
 import { fastestKernels } from "./kernels_simd.js";
-import { padded, Physics, prepareRule, numbersBelow, wrap } from "./physics.js";
+import { numbersBelow, padded, Physics, prepareRule, wrap } from "./physics.js";
 import { GpuPhysics, openDevice } from "./physics_gpu.js";
 
 // Maximum number of frames that the page has not drawn yet: the world waits for a slow or hidden page.
@@ -77,7 +77,8 @@ function startHelpers(code) {
   if (!code) return [];
   try {
     const address = URL.createObjectURL(new Blob([code], { type: "text/javascript" }));
-    return numbersBelow(Math.max(0, Math.min(MAX_HELPERS, (navigator.hardwareConcurrency >> 1) - 1))).map(() => new Worker(address));
+    const count = Math.min(MAX_HELPERS, (navigator.hardwareConcurrency >> 1) - 1);
+    return numbersBelow(Math.max(0, count)).map(() => new Worker(address));
   } catch {
     return [];
   }
