@@ -67,9 +67,11 @@ const INVERSES = {
   threshold: `if (abs(determinant) >= ${MOMENT_THRESHOLD}) { ${each(6, (n) => `m[${n}] = adjugate[${n}] / determinant;`)} }`,
 };
 
-// The shaders of one rule, in the order in which they run: `place` sorts copies of particles. Sizes are constants in them.
-const SHADERS = ["place", "density", "advance"];
+// The shaders, in the order in which they run, and whether they read or write the buffers of bindings 1 to 7: cards keep
+// near what a shader only reads. `place` sorts copies of particles.
+const SHADERS = { place: "wwrww--", density: "--rr-w-", advance: "wwrrrrr" };
 
+// The shaders of one rule: sizes are constants in them.
 export function shaders({ state_dim: channels, space_dim: dimension, inputs, hidden_dim: hidden, outputs, ...rule }) {
   const axes = ["x", "y", "z"].slice(0, dimension);
   const quads = Math.ceil(channels / 4), inputQuads = inputs / 4, outputQuads = Math.ceil(outputs / 4);
@@ -88,10 +90,13 @@ export function shaders({ state_dim: channels, space_dim: dimension, inputs, hid
   // In parts of world.capacity: particles sorted by cell; the cell of each particle; the active of sorted ones; and
   // where each cell begins.
   @group(0) @binding(3) var<storage, read> indices: array<u32>;
-  @group(0) @binding(4) var<storage, read_write> points: array<vec4f>;
-  @group(0) @binding(5) var<storage, read_write> states: array<vec4f>;
+  @group(0) @binding(4) var<storage, read> points: array<vec4f>;
+  @group(0) @binding(4) var<storage, read_write> newPoints: array<vec4f>;
+  @group(0) @binding(5) var<storage, read> states: array<vec4f>;
+  @group(0) @binding(5) var<storage, read_write> newStates: array<vec4f>;
   // The density's gradient, and the volume.
-  @group(0) @binding(6) var<storage, read_write> fields: array<vec4f>;
+  @group(0) @binding(6) var<storage, read> fields: array<vec4f>;
+  @group(0) @binding(6) var<storage, read_write> newFields: array<vec4f>;
   @group(0) @binding(7) var<storage, read> weights: array<vec4f>;
 
   // log(1 + n) / n; for small n without the logarithm, which would lose digits.
@@ -105,8 +110,8 @@ export function shaders({ state_dim: channels, space_dim: dimension, inputs, hid
     if (k >= world.count) { return; }
     let i = indices[k];
     let p = vec3f(${["x", "y", "z"].map((_, d) => (d < dimension ? `x[i * ${dimension} + ${d}]` : "0.0"))});
-    points[k] = vec4f(p - world.sides.xyz * floor(p * world.per.xyz + 0.5), 0.0);
-    ${each(quads, (q) => `states[k * ${quads} + ${q}] = vec4f(${numbersBelow(4).map((n) => state(4 * q + n))});`)}
+    newPoints[k] = vec4f(p - world.sides.xyz * floor(p * world.per.xyz + 0.5), 0.0);
+    ${each(quads, (q) => `newStates[k * ${quads} + ${q}] = vec4f(${numbersBelow(4).map((n) => state(4 * q + n))});`)}
   }
 
   @compute @workgroup_size(${GROUP})
@@ -116,7 +121,7 @@ export function shaders({ state_dim: channels, space_dim: dimension, inputs, hid
     var rho = 0.0;
     var gradient = vec3f(0.0);
     ${visitNeighbours("rho += w; gradient += spike * d;")}
-    fields[k] = vec4f(gradient, 1.0 / rho);
+    newFields[k] = vec4f(gradient, 1.0 / rho);
   }
 
   @compute @workgroup_size(${GROUP})
@@ -202,22 +207,28 @@ export class GpuPhysics {
     this.indices = buffer(4 * (3 * capacity + MAX_CELLS[dimension] ** dimension + 1), STORAGE | COPY_DST);
     this.mapped = buffer(4 * (dimension + channels) * capacity, MAP_READ | COPY_DST);
     const sorted = [16, 4 * width, 16].map((bytes) => buffer(bytes * capacity, STORAGE));
-    const read = "read-only-storage", types = ["uniform", "storage", "storage", read, "storage", "storage", "storage", read];
-    const entry = (type, binding) => ({ binding, visibility: GPUShaderStage.COMPUTE, buffer: { type } });
-    const layout = device.createBindGroupLayout({ entries: types.map(entry) });
-    const pipelines = device.createPipelineLayout({ bindGroupLayouts: [layout] });
+    const types = { u: "uniform", r: "read-only-storage", w: "storage" };
     this.species = rules.map((rule) => {
       const module = device.createShaderModule({ code: shaders(rule) }), packed = packedWeights(rule);
       const weights = buffer(packed.byteLength, STORAGE | COPY_DST);
       device.queue.writeBuffer(weights, 0, packed);
       const world = buffer(UNIFORM_BYTES, UNIFORM | COPY_DST);
       const buffers = [world, this.x, this.s, this.indices, ...sorted, weights];
-      const group = device.createBindGroup({
-        layout, entries: buffers.map((each, binding) => ({ binding, resource: { buffer: each } })),
+      const stages = Object.entries(SHADERS).map(([entryPoint, uses]) => {
+        const bindings = [...buffers.keys()].filter((binding) => `u${uses}`[binding] !== "-");
+        const entry = (binding) => ({
+          binding, visibility: GPUShaderStage.COMPUTE, buffer: { type: types[`u${uses}`[binding]] },
+        });
+        const layout = device.createBindGroupLayout({ entries: bindings.map(entry) });
+        const group = device.createBindGroup({
+          layout, entries: bindings.map((binding) => ({ binding, resource: { buffer: buffers[binding] } })),
+        });
+        const pipeline = device.createComputePipeline({
+          layout: device.createPipelineLayout({ bindGroupLayouts: [layout] }), compute: { module, entryPoint },
+        });
+        return { group, pipeline };
       });
-      const pipeline = (entryPoint) => device.createComputePipeline({ layout: pipelines, compute: { module, entryPoint } });
-      const stages = SHADERS.map(pipeline);
-      return { rule, world, group, stages };
+      return { rule, world, stages };
     });
     this.chosen = new Uint32Array(capacity);
   }
@@ -230,17 +241,17 @@ export class GpuPhysics {
     const encoder = device.createCommandEncoder();
     const pass = encoder.beginComputePass();
     let rows = 0;
-    this.species.forEach(({ rule, world: uniform, group, stages }, number) => {
+    this.species.forEach(({ rule, world: uniform, stages }, number) => {
       const firstRow = rows;
       for (let k = 0; k < count; k++) {
         if (species[order[k]] === number && (mask === null || mask[order[k]] !== 0)) chosen[rows++] = k;
       }
       write(uniform, uniforms(physics, rule, count, firstRow, rows - firstRow, densityCounts?.[number] ?? count));
-      pass.setBindGroup(0, group);
       const threads = [count, count, rows - firstRow];
-      stages.forEach((stage, n) => {
+      stages.forEach(({ group, pipeline }, n) => {
         if (threads[n] === 0 || (n < 2 && number > 0)) return;
-        pass.setPipeline(stage);
+        pass.setPipeline(pipeline);
+        pass.setBindGroup(0, group);
         pass.dispatchWorkgroups(Math.ceil(threads[n] / GROUP));
       });
     });
