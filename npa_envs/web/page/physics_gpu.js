@@ -67,8 +67,8 @@ const INVERSES = {
   threshold: `if (abs(determinant) >= ${MOMENT_THRESHOLD}) { ${each(6, (n) => `m[${n}] = adjugate[${n}] / determinant;`)} }`,
 };
 
-// The shaders, in the order in which they run, and whether they read or write the buffers of bindings 1 to 7: cards keep
-// near what a shader only reads. `place` sorts copies of particles.
+// The shaders, in the order in which they run, and whether they read or write the buffers of bindings 1 to 7: cards may
+// cache what a shader only reads. `place` sorts copies of particles.
 const SHADERS = { place: "wwrww--", density: "--rr-w-", advance: "wwrrrrr" };
 
 // The shaders of one rule: sizes are constants in them.
