@@ -180,7 +180,7 @@ def in_the_plane(points: Tensor) -> Tensor:
         try:
             from umap import UMAP
 
-            method: Any = UMAP(random_state=0)
+            method: Any = UMAP(n_jobs=1, random_state=0)
         except ImportError:
             from sklearn.manifold import TSNE
 

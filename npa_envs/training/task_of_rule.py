@@ -90,15 +90,14 @@ def task_of_rule(
         _check_data(config.task)
         task = entry.make(config.task, device).held_out().for_rule(rule)
     except NPAError as error:
-        replaced = {"target": name for name in entry.targets()[:1]}
-        if getattr(config.task, "class_count", 0) >= BUILT_IN_CLASSES:
-            replaced = {"data": "digits"}
-            if not chosen:
-                left_out(source, str(error), what="scikit-learn's digits instead")
-        if chosen or not replaced:
+        clouds = getattr(config.task, "class_count", 0) >= BUILT_IN_CLASSES
+        name, known_names = ("data", ("digits",)) if clouds else ("target", entry.targets())
+        if chosen or not known_names:
             raise
-        why_not_measurable = f"its {next(iter(replaced))} cannot be loaded: {error}"
-        config = override(config, **replaced)
+        if clouds:
+            left_out(source, str(error), what="scikit-learn's digits instead")
+        why_not_measurable = f"its {name} cannot be loaded: {error}"
+        config = override(config, **{name: known_names[0]})
         task = entry.make(config.task, device).held_out()
         if rule.codes is not None:
             target = replace(cast(Morphogenesis2D, task).target, name=rule.codes.names[0])

@@ -178,6 +178,23 @@ def test_mutated_worlds_keep_their_states(folder):
     assert_goals_fit(new_x, new_goal, task.clouds)
 
 
+def test_a_quarter_on_one_side_is_moved_out_of_sight_of_the_rest(folder, device):
+    task = task_of(folder, device, cut_share=0.5)
+    worlds = task.seed(200, generator=seeded(1, device), device=device)
+    cut = task.damage(worlds, seeded(2, device))
+    assert torch.equal(cut.goal, worlds.goal)
+    assert torch.equal(cut.s, worlds.s)
+    away = torch.linalg.vector_norm(cut.x - worlds.x, dim=-1)
+    moved = away > 0.0
+    hit = moved.any(1)
+    # Half of 200: 100 ± 7.
+    assert 65 < int(hit.sum()) < 135
+    assert (moved.sum(1)[hit] == 6).all()
+    torch.testing.assert_close(away[moved], torch.full_like(away[moved], 2.0 * task.eps))
+    apart = torch.cdist(cut.x, cut.x)[moved[:, :, None] & ~moved[:, None] & hit[:, None, None]]
+    assert float(apart.min()) > task.eps
+
+
 def test_accuracies_are_those_of_a_rollout(folder, device):
     task = task_of(folder, device, readout_hidden_dim=5, update_prob=1.0).held_out()
     rule = task.make_rule(seeded(3))
@@ -349,7 +366,7 @@ def test_umap_is_taken_where_it_is_installed_and_films_show_classes_draw_togethe
     monkeypatch.setitem(sys.modules, "umap", SimpleNamespace(UMAP=UMAP))
     states = two_steps()
     frames, strip = film_states(states, GROUPS, (2, 9), resolution=64, between=3)
-    assert made == [{"random_state": 0}]
+    assert made == [{"n_jobs": 1, "random_state": 0}]
     assert len(frames) == 5
     assert np.array_equal(strip, [frames[0], frames[4]])
     inked = [(frame.min(axis=2) < 200).nonzero() for frame in strip]
