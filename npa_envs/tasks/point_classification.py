@@ -57,8 +57,8 @@ class PointClassificationConfig(TaskConfig):
     and keeps its states (dimensionless)."""
 
     cut_share: float = 0.0
-    """Probability that a quarter of a damaged world from the pool, on a random side, is moved out of
-    sight of the rest; the class stays (dimensionless)."""
+    """Probability that a damaged world from the pool has the quarter of its particles on a random
+    side moved out of sight of the others, and keeps its class (dimensionless)."""
 
     particle_count: Common[int] = 512
     """Particles in a world, N: points of a cloud."""
