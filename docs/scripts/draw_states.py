@@ -32,7 +32,7 @@ def main() -> None:
     trained = task_of_rule(NAME, rule, torch.device("cpu"))
     task = cast(PointClassification, trained.task)
     states, label = hidden_states(rule, task, cloud_count=CLOUDS, particle_count=PARTICLES)
-    frames, _ = film_states(states, label, STATE_STEPS, resolution=256, between=BETWEEN)
+    frames, _ = film_states(states, label, STATE_STEPS, between=BETWEEN)
     # What is agreed comes first: it is what is seen of a film that does not play.
     write_webp(IMAGES / "states_mnist.webp", [frames[-1]] * STILL + frames, 10, quality=40)
 

@@ -105,9 +105,9 @@ def write_report(
     was trained: iterations, time and command.
 
     The folder gets the model card STEM.md, STEM.json as of `npa-envs evaluate --json`, STEM.gif,
-    STEM.mp4 and STEM-filmstrip.png, for a 3D rule also a turntable and point files, for one that
-    classifies STEM-states.gif and STEM-states.png. On a CPU fewer
-    worlds are measured, for fewer steps, and only pictures and objects are damaged.
+    STEM.mp4, STEM-filmstrip.png, for a 3D rule also a turntable and point files, for a classifier
+    STEM-states.gif and STEM-states.png. On a CPU fewer worlds are measured, for fewer steps, and
+    only pictures and objects are damaged.
     """
     common.writable_folder(folder)
     rule = load_rule(path, device=device).float()

@@ -26,8 +26,7 @@ class RobustnessOptions(common.MeasureOptions):
 
     rules: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="RULES")] = ()
     """Shipped rules (`npa-envs list`), initial rules of presets (`seven-pictures`), files of rules,
-    or folders of runs; default: all shipped ones whose data are there, or one of each task when
-    quick."""
+    or folders of runs; default: the shipped ones whose data are there, when quick one of a task."""
     seed_count: int | None = None
     """Worlds of each condition, each from its own seed; default: 8, or 2 when quick."""
     quick: bool = False

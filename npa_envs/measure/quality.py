@@ -371,15 +371,15 @@ def hidden_states(
     """
     check_steps("steps", steps)
     label = task.clouds.label
-    kinds = [torch.nonzero(label == kind)[:cloud_count, 0] for kind in label.unique()]
-    chosen = torch.cat(kinds)
+    firsts = [torch.nonzero(label == kind)[:cloud_count, 0] for kind in sorted(set(label.tolist()))]
+    chosen = torch.cat(firsts)
     runner = _copied_runner(rule, task, label.device, seed, None)
     history = [
         worlds.s[:, :: max(1, worlds.s.shape[1] // particle_count)][:, :particle_count]
         for _, worlds in runner.at(steps, _zero_clouds(runner, chosen))
     ]
-    count = history[0].shape[1]
-    return torch.stack(history).flatten(1, 2), label[chosen].repeat_interleave(count)
+    label = label[chosen].repeat_interleave(history[0].shape[1])
+    return torch.stack(history).flatten(1, 2), label
 
 
 def _zero_clouds(runner: RuleRunner, index: Tensor) -> Particles:

@@ -180,25 +180,20 @@ def in_the_plane(points: Tensor) -> Tensor:
         try:
             from umap import UMAP
 
-            method: Any = UMAP(n_jobs=1, random_state=0)
+            method = UMAP(n_jobs=1, random_state=0)
         except ImportError:
             from sklearn.manifold import TSNE
 
             perplexity = min(30.0, (len(values) - 1) / 3)
             method = TSNE(perplexity=perplexity, max_iter=500, init="pca", random_state=0)
     except ImportError:
-        centred = values - values.mean(0)
-        return (centred @ torch.linalg.svd(centred, full_matrices=False)[2][:2].T).float()
+        left, size, _ = torch.linalg.svd(values - values.mean(0), full_matrices=False)
+        return torch.mul(left, size)[:, :2].float()
     return torch.from_numpy(method.fit_transform(values.numpy())).float()
 
 
 def film_states(
-    states: Tensor,
-    label: Tensor,
-    steps: Sequence[int],
-    *,
-    resolution: int = SCREEN,
-    between: int = 6,
+    states: Tensor, label: Tensor, steps: Sequence[int], *, between: int = 6
 ) -> tuple[list[Frame], list[Frame]]:
     """Return a film of hidden states at T steps, [T, P, C], and those of its frames at the steps.
 
@@ -208,12 +203,11 @@ def film_states(
     """
     x = in_the_plane(states.flatten(0, 1))
     low, high = x.aminmax(dim=0)
-    edge = 1.0 + 2.0 * DOT
     x = ((2.0 * x - low - high) / (high - low).max()).view(len(steps), -1, 2)
-    label = label.cpu()
+    label, edge = label.cpu(), 1.0 + 2.0 * DOT
     colour = class_colours(torch.nn.functional.one_hot(label).float())[None]
-    size: dict[str, Any] = {"resolution": resolution, "pixel_size": DOT, "lo": -edge, "hi": edge}
-    font: Any = ImageFont.load_default(resolution / 16)
+    size: dict[str, Any] = {"resolution": SCREEN, "pixel_size": DOT, "lo": -edge, "hi": edge}
+    font: Any = ImageFont.load_default(SCREEN / 16)
     frames = []
     for count in range((len(steps) - 1) * (between + 1) + 1):
         last, part = divmod(count, between + 1)
@@ -222,10 +216,9 @@ def film_states(
         frame = Image.fromarray(to_uint8(splat(now[None], colour, sigma=DOT_SIGMA, **size)[0]))
         draw = ImageDraw.Draw(frame)
         draw.text((4, 2), f"step {steps[last]}", "#333333", font)
-        for number in label.unique().tolist() if last == after else ():
+        for number in set(label.tolist()) if last == after else ():
             across, up = (now[label == number].median(0).values / edge).tolist()
-            place = 0.5 * resolution * (1.0 + across), 0.5 * resolution * (1.0 - up)
-            outline = {"anchor": "mm", "stroke_width": 2, "stroke_fill": "white"}
-            draw.text(place, str(number), "black", font, **outline)
+            place = 0.5 * SCREEN * (1.0 + across), 0.5 * SCREEN * (1.0 - up)
+            draw.text(place, str(number), "black", font, "mm", stroke_width=2, stroke_fill="white")
         frames.append(np.asarray(frame))
     return frames, frames[:: between + 1]

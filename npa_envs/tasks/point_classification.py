@@ -192,8 +192,7 @@ class PointClassification(ParticleTask[PointClassificationConfig]):
             other = worlds._replace(x=other.x.to(x.dtype), goal=other.goal)
             worlds = other.where(drawn_worlds(x, generator, mutated), worlds)
         if cut > 0.0:
-            normal = normal_draws(generator, (len(x), 2), x)[:, None]
-            normal = normal / torch.linalg.vector_norm(normal, dim=-1, keepdim=True)
+            normal = torch.nn.functional.normalize(normal_draws(generator, (len(x), 2), x))[:, None]
             height = worlds.x[..., :1] * normal[..., :1] + worlds.x[..., 1:] * normal[..., 1:]
             bound = height.sort(dim=1).values[:, 3 * x.shape[1] // 4 :][:, :1]
             # As far from the rest as if they were gone.

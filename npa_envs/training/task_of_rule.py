@@ -18,7 +18,7 @@ from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.base import Task
 from npa_envs.tasks.many_pictures import named_targets
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2D
-from npa_envs.tasks.targets.digit_clouds import BUILT_IN_CLASSES, data_path
+from npa_envs.tasks.targets.digit_clouds import data_path
 from npa_envs.tasks.targets.notes import left_out
 from npa_envs.training.task_table import override, preset, task_entry
 
@@ -90,7 +90,7 @@ def task_of_rule(
         _check_data(config.task)
         task = entry.make(config.task, device).held_out().for_rule(rule)
     except NPAError as error:
-        clouds = getattr(config.task, "class_count", 0) >= BUILT_IN_CLASSES
+        clouds = getattr(config.task, "class_count", 0) >= 10  # as scikit-learn's digits
         name, known_names = ("data", ("digits",)) if clouds else ("target", entry.targets())
         if chosen or not known_names:
             raise
@@ -115,11 +115,10 @@ def _check_data(config: Any) -> None:
 def has_data(source: str) -> bool:
     """Return whether the data set that a rule was trained on is there; True for other tasks."""
     path, metadata = _file_of(source)
-    try:
+    with contextlib.suppress(NPAError):
         _check_data(trained_config(path, metadata).task if "config" in metadata else None)
-    except NPAError:
-        return False
-    return True
+        return True
+    return False
 
 
 def trained_task_name(source: str) -> str:

@@ -365,14 +365,14 @@ def test_umap_is_taken_where_it_is_installed_and_films_show_classes_draw_togethe
 
     monkeypatch.setitem(sys.modules, "umap", SimpleNamespace(UMAP=UMAP))
     states = two_steps()
-    frames, strip = film_states(states, GROUPS, (2, 9), resolution=64, between=3)
+    frames, strip = film_states(states, GROUPS, (2, 9), between=3)
     assert made == [{"n_jobs": 1, "random_state": 0}]
     assert len(frames) == 5
     assert np.array_equal(strip, [frames[0], frames[4]])
     inked = [(frame.min(axis=2) < 200).nonzero() for frame in strip]
     # Below the text the dots are at one place, then in two corners.
-    before, after = (np.ptp(columns[rows > 12]) for rows, columns in inked)
-    assert before < 20 < 40 < after
+    before, after = (np.ptp(columns[rows > 48]) for rows, columns in inked)
+    assert before < 80 < 160 < after
     # The last frame has names where the dots are.
     pure, mixed = (np.abs(frames[k] - np.array([230.0, 26.0, 74.0])).max(2).min() for k in (3, 0))
     assert pure < 30 < 60 < mixed

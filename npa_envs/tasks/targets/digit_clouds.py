@@ -221,9 +221,6 @@ def augmented(
 BUILT_IN = ("digits", "mnist")
 """Data sets by name; everything else is a folder of IDX files."""
 
-BUILT_IN_CLASSES = 10
-"""Number of their classes."""
-
 TEST_FRACTION = 0.2
 """Fraction of each class of scikit-learn's digits that is in the test split."""
 
