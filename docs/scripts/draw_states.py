@@ -21,7 +21,7 @@ from npa_envs.tasks.point_classification import PointClassification
 from npa_envs.training.task_of_rule import task_of_rule
 
 NAME = "mnist"
-CLOUDS, PARTICLES = 25, 3
+CLOUDS, PARTICLES = 20, 3
 BETWEEN = 3
 """Frames between two steps."""
 
@@ -34,7 +34,7 @@ def main() -> None:
     states, label = hidden_states(rule, task, cloud_count=CLOUDS, particle_count=PARTICLES)
     frames, _ = film_states(states, label, STATE_STEPS, between=BETWEEN)
     # What is agreed comes first: it is what is seen of a film that does not play.
-    write_webp(IMAGES / "states_mnist.webp", [frames[-1]] * STILL + frames, 10, quality=40)
+    write_webp(IMAGES / "states_mnist.webp", [frames[-1]] * STILL + frames, 10, quality=30)
 
 
 if __name__ == "__main__":
