@@ -13,7 +13,7 @@ CPU alone. A library that is not installed is left out, and so are more worlds t
 `--longest` seconds allows.
 
 `--output` writes the entry `agents` of a JSON file, and leaves the file's other entries as they
-are. `--draw FILE` draws such a file's entry without measuring.
+are. `--draw FILE FILE` draws such files' entries without measuring.
 """
 
 from __future__ import annotations
@@ -293,29 +293,33 @@ def entries(arguments: Any, left_out: dict[str, str]) -> Iterator[Entry]:
                 yield Entry(contender, case, runner, [])
 
 
-def draw(record: dict[str, Any]) -> bytes:
-    """Return a PNG of agent-steps a second against worlds, a panel for each number of agents."""
-    rows = record["rows"]
-    agent_counts = sorted({row["agents"] for row in rows})
-    figure, panels = new_figure(1, len(agent_counts), (9.0, 4.2))
-    for panel, agent_count in zip(panels[0], agent_counts, strict=True):
-        for number, contender in enumerate(CONTENDERS):
-            found = [
-                (row["world_count"], row["agent_steps_per_s"])
-                for row in rows
-                if row["name"] == contender.name and row["agents"] == agent_count
-            ]
-            style = "o-" if contender.library == "npa_envs" else "s--"
-            panel.loglog(
-                *zip(*found, strict=True) if found else ((), ()),
-                style,
-                color=f"C{number}",
-                label=contender.name,
-            )
-        panel.set(xlabel="worlds", ylabel="agent-steps a second", title=f"{agent_count} agents")
-        number_plainly(panel.xaxis, sorted({row["world_count"] for row in rows}))
-        number_plainly(panel.yaxis)
-        panel.grid(alpha=0.3)
+def draw(records: Sequence[dict[str, Any]]) -> bytes:
+    """Return a PNG of agent-steps a second against worlds: a row for each machine's record."""
+    agent_counts = sorted({row["agents"] for record in records for row in record["rows"]})
+    figure, panels = new_figure(len(records), len(agent_counts), (9.0, 0.6 + 3.3 * len(records)))
+    for across, record in zip(panels, records, strict=True):
+        rows = record["rows"]
+        for panel, agent_count in zip(across, agent_counts, strict=True):
+            for number, contender in enumerate(CONTENDERS):
+                found = [
+                    (row["world_count"], row["agent_steps_per_s"])
+                    for row in rows
+                    if row["name"] == contender.name and row["agents"] == agent_count
+                ]
+                style = "o-" if contender.library == "npa_envs" else "s--"
+                panel.loglog(
+                    *zip(*found, strict=True) if found else ((), ()),
+                    style,
+                    color=f"C{number}",
+                    label=contender.name,
+                )
+            panel.set(xlabel="worlds", ylabel="agent-steps a second")
+            panel.set_title(f"{agent_count} agents, {record['machine']}")
+            counts = sorted({row["world_count"] for row in rows})
+            panel.set_xticks(counts, [str(count) for count in counts])
+            panel.minorticks_off()
+            number_plainly(panel.yaxis)
+            panel.grid(alpha=0.3)
     legend_of(figure, panels[0, 0], "right center")
     return png(figure)
 
@@ -329,10 +333,10 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=5, help="readings of each")
     parser.add_argument("--longest", type=float, default=20.0, help="seconds of an episode")
     parser.add_argument("--plot", type=Path, help="PNG file to draw")
-    parser.add_argument("--draw", type=Path, help="JSON file to draw, without measuring")
+    parser.add_argument("--draw", type=Path, nargs="+", help="JSON files to draw, not measuring")
     arguments = parser.parse_args()
     if arguments.draw:
-        write_bytes(arguments.plot, draw(read_json(arguments.draw)["agents"]))
+        write_bytes(arguments.plot, draw([read_json(path)["agents"] for path in arguments.draw]))
         return
     torch.set_num_threads(arguments.threads)
     kind = torch.device(arguments.device).type
@@ -360,7 +364,7 @@ def main() -> None:
             f"{row['step_us']:12.1f} µs a step {row['agent_steps_per_s']:12.4g} agent-steps/s"
         )
     if arguments.plot:
-        write_bytes(arguments.plot, draw(record))
+        write_bytes(arguments.plot, draw([record]))
 
 
 if __name__ == "__main__":

@@ -176,27 +176,31 @@ def _world(space_dim: int, particle_count: int, device: torch.device) -> World:
 
 
 def draw(rows: Sequence[PeerRow]) -> Any:
-    """Return the figure: time against particles, forward and with backward, 2D above 3D."""
+    """Return the figure, 2D above 3D: time, forward and with backward, and the latter's memory."""
     space_dims = sorted({row.space_dim for row in rows})
-    figure, panels = new_figure(len(space_dims), 2, (9.2, 0.8 + 3.2 * len(space_dims)))
+    columns = 2 if rows[0].memory_mib is None else 3
+    figure, panels = new_figure(len(space_dims), columns, (11.0, 0.8 + 2.9 * len(space_dims)))
+    measured = {row.peer for row in rows}
     for across, space_dim in zip(panels, space_dims, strict=True):
-        for panel, backward in zip(across, (False, True), strict=True):
+        for column, panel in enumerate(across):
             for number, name in enumerate(PEERS):
-                key = (name, backward, space_dim)
+                if name not in measured:
+                    continue
+                key = (name, column > 0, space_dim)
                 found = [r for r in rows if (r.peer, r.backward, r.space_dim) == key]
                 ours = PEERS[name].run is perceive
-                style = {"color": "black" if ours else f"C{number}", "lw": 3.0 if ours else 1.2}
+                style = {"color": "black" if ours else f"C{number}", "lw": 2.4 if ours else 1.2}
                 style["ls"] = ":" if PEERS[name].graph else "-"
-                times = [row.time_us.median / 1e3 for row in found]
-                panel.plot(
-                    [r.particles for r in found], times, marker="o", ms=3, label=name, **style
-                )
-            panel.set(xscale="log", yscale="log", xlabel="particles", ylabel="time [ms]")
-            panel.set_title(f"{space_dim}D, {'with backward' if backward else 'forward'}")
+                values = [r.memory_mib if column == 2 else r.time_us.median / 1e3 for r in found]
+                sizes = [row.particles for row in found]
+                panel.plot(sizes, values, marker="o", ms=3, label=name, **style)
+            panel.set(xscale="log", yscale="log", xlabel="particles")
+            panel.set_ylabel("memory [MiB]" if column == 2 else "time [ms]")
+            panel.set_title(f"{space_dim}D, {'with backward' if column else 'forward'}")
             panel.grid(alpha=0.3)
             for axis in (panel.xaxis, panel.yaxis):
                 number_plainly(axis)
-    legend_of(figure, panels[0][0], ncols=4, fontsize=8)
+    legend_of(figure, panels[0][0], ncols=5, fontsize=9)
     return figure
 
 

@@ -204,7 +204,8 @@ class ShapeshifterTask(RuleDrivenTask[Shapeshifter2DEnvConfig]):
     ) -> tuple[Tensor, Tensor]:
         """Return x and s after steps of the rule with codes `action`, shape [B, 1, code_dim]."""
         coded = Particles(x, self.rule.with_code(s, action))
-        x, s, *_ = run_rule(self.rule, self.config, coded, self.config.rule_steps, random)
+        steps = self.config.rule_steps
+        x, s, *_ = run_rule(self.rule, self.config, coded, steps, random, cuda_graph="whole")
         return x, s
 
     def reward(self, particles: Particles, loss: Tensor, context: PictureGoals) -> Tensor:

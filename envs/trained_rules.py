@@ -124,7 +124,7 @@ def run_rule(
     random: WorldRandom,
     **changes: Any,
 ) -> Particles:
-    """Return worlds after `steps` of a rule, with constants of `config` except for `changes`."""
+    """Return worlds after `steps` of a rule, with options from `config` except for `changes`."""
     names = ("eps", "box", "boundary", "update_prob", "dt", "position_noise")
     constants = {name: getattr(config, name) for name in names} | changes
     # A world is the same in every batch; on CUDA it is anyway.
@@ -190,8 +190,7 @@ class RuleDrivenWorlds(BatchedWorlds):
         """Step the worlds without synchronising; return observations, in `out` if it is given."""
         if self._graph is None:
             self._action = torch.zeros(action.shape, device=self.device)
-            # Launched kernel by kernel: no machine with CUDA has run the capture yet.
-            self._graph = GraphedCallable(self._step_and_observe, self.device, captured=False)
+            self._graph = GraphedCallable(self._step_and_observe, self.device)
             self.random_steps = self.task.config.rule_steps
         load_async(action, self._action)
         flag_unless_finite(self._action, self.enabled)

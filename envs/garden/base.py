@@ -119,7 +119,9 @@ class GardenTask(RuleDrivenTask[Config], GrownTask[Config]):
     ) -> Particles:
         """Return worlds after the brushes and the rule's steps, before `disturb`."""
         config = self.config
-        run = partial(run_rule, self.rule, config, random=random, detach_positions=False)
+        run = partial(
+            run_rule, self.rule, config, random=random, detach_positions=False, cuda_graph="whole"
+        )
         middle = self.middle(particles.x)
         particles, rate = apply_brushes(particles, action, middle, config, self.deficit.places)
         if rate is None:

@@ -168,14 +168,15 @@ _RUNS: Mapping[str, Mapping[str, Any]] = {
     "best": {
         "optimiser": "adamw", "learning_rate": 2e-3, "weight_decay": 0.0,
         "max_age_range": (64, 16_384), "damage_and_keep_share": 0.0, "damage_share": 0.25,
-        "stillness_min_age": 512, "stillness_power": 1.0, "dead_zone": 0.0,
+        "stillness_min_age": 512, "stillness_power": 1.0, "dead_zone": 0.0, "iterations": 8000,
+        "wound_chance": 0.0, "wound_weight": 0.0,
     },
     "fast": {**SPECIES_RUN, "learning_rate": 4e-3},
 }  # fmt: skip
 """Settings of the runs that docs/species.md measured, by AdamW."""
 
 _SPECIES: Mapping[str, Mapping[str, Any]] = {
-    "best": {"cut_share": 0.25},
+    "best": {"cut_share": 0.25, "cut_anywhere": False},
     "fast": {"hidden_dim": 64},
 }
 """Settings of each species in those measurements."""

@@ -282,7 +282,7 @@ def _capture(
     # graphs read and the next replay writes. So the two streams wait for each other.
     stream.wait_stream(current)
     try:
-        with torch.cuda.stream(stream), no_garbage_collection():
+        with torch.cuda.stream(stream), no_garbage_collection(), _own_workspaces():
             sequence.begin()
             before = _capturing.set(sequence)
             try:
@@ -301,6 +301,20 @@ def _capture(
         raise
     current.wait_stream(stream)
     return sequence
+
+
+@contextlib.contextmanager
+def _own_workspaces() -> Iterator[None]:
+    """Have a capture in the block allocate memory of its own for cuBLAS's intermediate results.
+
+    Torch allocates it once for each stream and thread. Graphs captured on one stream would share
+    it, and write over each other's products when they are replayed on several streams at once.
+    """
+    torch._C._cuda_clearCublasWorkspaces()
+    try:
+        yield
+    finally:
+        torch._C._cuda_clearCublasWorkspaces()
 
 
 def may_be_disturbed(attempts: int) -> bool:

@@ -89,7 +89,8 @@ def test_repeated_launches_have_the_results_of_the_first(
     for found, first in kept:
         assert_same(found, first)
     # With and without gradients, backward and fields, of two sizes; threads have their own.
-    assert len(repeats) >= 8
+    # On CUDA float64 is sorted with the help of torch's sums, so only backward passes are repeated.
+    assert len(repeats) >= (2 if dtype == torch.float64 and device.type == "cuda" else 8)
 
 
 LOOP = """

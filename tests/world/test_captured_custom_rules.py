@@ -325,7 +325,7 @@ def test_frozen_layers_are_followed():
     rule.hidden.requires_grad_(False)
     as_launched(rule)
     rule.hidden.requires_grad_(True)
-    as_launched(rule, 1)
+    as_launched(rule, calls=1)
 
 
 @pytest.mark.gpu
