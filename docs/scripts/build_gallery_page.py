@@ -27,7 +27,7 @@ HEADINGS = {
     "morphogenesis2d": "Pictures",
     "morphogenesis3d": "Things in 3D",
     "texture": "Textures",
-    "point_classification": "A classifier",
+    "point_classification": "Classifiers",
 }
 SHOWN = {
     "morphogenesis2d": "{name} grows from a grey disk, is cut in two, and heals.",

@@ -112,8 +112,8 @@ def _measure_task(options: EvaluateOptions, rule: NPARule, **worlds: Any) -> Res
     task = trained.task
     if trained.why_not_measurable is not None:
         raise NPAError(
-            f"cannot measure {options.rule!r}: {trained.why_not_measurable}: "
-            "give --target, a built-in name or a picture"
+            f"cannot measure {options.rule!r}: {trained.why_not_measurable}: give "
+            + ("--data" if task.classifies else "--target, a built-in name or a picture")
         )
     changed = task.classifies or options.healing
     total = quality.step_count(task, checkpoints=options.checkpoints, changed=changed)

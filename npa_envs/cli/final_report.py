@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields
 from datetime import date
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import torch
 
@@ -29,6 +29,8 @@ from npa_envs.measure.quality import (
     CHECKPOINTS,
     CLOUD_CHECKPOINTS,
     FIRST_SEED,
+    STATE_STEPS,
+    hidden_states,
     picture_rows,
     picture_step_count,
     score_line,
@@ -37,8 +39,8 @@ from npa_envs.measure.quality import (
 )
 from npa_envs.measure.wounds import WoundRow
 from npa_envs.render.colours import to_uint8
-from npa_envs.render.picture_files import write_filmstrip
-from npa_envs.render.world_film import SCREEN, film_world, write_3d_world
+from npa_envs.render.picture_files import write_filmstrip, write_gif
+from npa_envs.render.world_film import SCREEN, film_states, film_world, write_3d_world
 from npa_envs.rule.files import load_rule
 from npa_envs.tasks.damage import DamageEvent
 from npa_envs.training.task_of_rule import task_for_film, task_of_rule, tasks_of_codes
@@ -46,6 +48,7 @@ from npa_envs.training.task_of_rule import task_for_film, task_of_rule, tasks_of
 if TYPE_CHECKING:
     from npa_envs.rule.rule import NPARule
     from npa_envs.tasks.base import Task
+    from npa_envs.tasks.point_classification import PointClassification
 
 FILM_STEPS = 512
 """Steps of the film."""
@@ -102,8 +105,9 @@ def write_report(
     was trained: iterations, time and command.
 
     The folder gets the model card STEM.md, STEM.json as of `npa-envs evaluate --json`, STEM.gif,
-    STEM.mp4 and STEM-filmstrip.png, for a 3D rule also a turntable and point files. On a CPU fewer
-    worlds are measured, for fewer steps, and only pictures and objects are damaged.
+    STEM.mp4, STEM-filmstrip.png, for a 3D rule also a turntable and point files, for a classifier
+    STEM-states.gif and STEM-states.png. On a CPU fewer worlds are measured, for fewer steps, and
+    only pictures and objects are damaged.
     """
     common.writable_folder(folder)
     rule = load_rule(path, device=device).float()
@@ -137,6 +141,7 @@ def write_report(
     write_text(folder / f"{path.stem}.json", text)
     model_card = folder / f"{path.stem}.md"
     names = {"The target, and a world.": "target", "A world from the seed on.": "filmstrip"}
+    names["Hidden states of particles, projected to the plane, by class."] = "states"
     pictures = "\n\n".join(
         f"![{text}]({path.stem}-{name}.png)"
         for text, name in names.items()
@@ -160,7 +165,12 @@ def _write_films(
         rule, film_task, seed_world, FILM_STEPS, generator=generator, damages=damages,
         progress=advance,
     )  # fmt: skip
-    if not task.classifies:
+    if task.classifies:
+        states, label = hidden_states(rule, cast("PointClassification", task), seed=FIRST_SEED)
+        frames, strip = film_states(states, label, STATE_STEPS)
+        write_gif(folder / f"{path.stem}-states.gif", frames, fps=12)
+        write_filmstrip(folder / f"{path.stem}-states.png", strip, columns=5)
+    else:
         last = max(index for index, step in film.steps.items() if step <= GROWN)
         frames = [to_uint8(film_task.target_picture, film.background), film.frames[last]]
         captions = ["target", film.captions[last]]

@@ -26,7 +26,7 @@ class RobustnessOptions(common.MeasureOptions):
 
     rules: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="RULES")] = ()
     """Shipped rules (`npa-envs list`), initial rules of presets (`seven-pictures`), files of rules,
-    or folders of runs; default: all shipped ones, or one of each task when quick."""
+    or folders of runs; default: the shipped ones whose data are there, when quick one of a task."""
     seed_count: int | None = None
     """Worlds of each condition, each from its own seed; default: 8, or 2 when quick."""
     quick: bool = False
@@ -47,10 +47,11 @@ def main(arguments: Sequence[str]) -> int:
     from npa_envs.measure.robustness import report
     from npa_envs.measure.robustness.trials import PLANS, RuleTrial, quick_plan
     from npa_envs.rule.files import load_rule, rule_digest, shipped_rules
+    from npa_envs.training.task_of_rule import has_data
 
     common.check_numbers(options, seed_count=1, threads=1)
     enough = time_limit(options.max_seconds)
-    sources = common.named_rules(options.rules or shipped_rules())
+    sources = common.named_rules(options.rules or filter(has_data, shipped_rules()))
     names = list(sources)
     if options.quick and not options.rules:
         # One of each task.

@@ -129,7 +129,8 @@ def print_measures(
     if step < options.steps:
         print(f"stopped at step {step} of {options.steps}; the film goes that far")
     if trained.why_not_measurable is not None:
-        print(f"no metrics for {options.rule}: {trained.why_not_measurable}; give --target")
+        option = "--data" if task.classifies else "--target"
+        print(f"no metrics for {options.rule}: {trained.why_not_measurable}; give {option}")
     else:
         row = measure(task, grown.x, grown.s, step)
         print(f"step {step}: {row.summary}, extent {row.extent:.3f}")

@@ -237,6 +237,9 @@ CUT_FRACTION = 0.25
 SETTLE_STEPS, CHANGED_STEPS = 32, (0, 32, 64, 128)
 """Default steps of `changes_of_mind` before a change of the clouds, and those measured after it."""
 
+STATE_STEPS = (2, 4, 6, 8, 10, 12, 16, 24, 48)
+"""Default steps of `hidden_states`."""
+
 CLOUD_BATCH = 256
 """Maximum number of clouds that run at once."""
 
@@ -350,6 +353,33 @@ def changes_of_mind(
         ChangeRow(*case, *row)
         for case, row in zip(cases, _cloud_means(task, measured), strict=True)
     ]
+
+
+@torch.no_grad()
+def hidden_states(
+    rule: NPARule,
+    task: PointClassification,
+    *,
+    steps: Sequence[int] = STATE_STEPS,
+    cloud_count: int = 16,
+    particle_count: int = 3,
+    seed: int = 0,
+) -> tuple[Tensor, Tensor]:
+    """Return states of P particles at T increasing `steps`, [T, P, C], and their classes, [P].
+
+    They are `particle_count` particles of each of the first `cloud_count` clouds of each class.
+    """
+    check_steps("steps", steps)
+    label = task.clouds.label
+    firsts = [torch.nonzero(label == kind)[:cloud_count, 0] for kind in sorted(set(label.tolist()))]
+    chosen = torch.cat(firsts)
+    runner = _copied_runner(rule, task, label.device, seed, None)
+    history = [
+        worlds.s[:, :: max(1, worlds.s.shape[1] // particle_count)][:, :particle_count]
+        for _, worlds in runner.at(steps, _zero_clouds(runner, chosen))
+    ]
+    label = label[chosen].repeat_interleave(history[0].shape[1])
+    return torch.stack(history).flatten(1, 2), label
 
 
 def _zero_clouds(runner: RuleRunner, index: Tensor) -> Particles:

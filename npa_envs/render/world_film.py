@@ -1,4 +1,4 @@
-"""Films of one world: frames drawn during a rollout, which may have damage, and their files."""
+"""Films of one world, drawn during a rollout, which may have damage, and of hidden states."""
 
 from __future__ import annotations
 
@@ -7,11 +7,14 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 import torch
+from PIL import Image, ImageDraw, ImageFont
+from torch import Tensor
 
+from npa_envs.ops import splat
 from npa_envs.render.colours import to_uint8
 from npa_envs.render.picture_files import (
     Frame,
@@ -25,6 +28,7 @@ from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.base import Task
 from npa_envs.tasks.damage import DamageEvent, damage_worlds
 from npa_envs.tasks.morphogenesis3d import Morphogenesis3D
+from npa_envs.tasks.point_classification import class_colours
 from npa_envs.world.particles import Particles
 from npa_envs.world.rollout import rollout_particles
 
@@ -157,3 +161,64 @@ def write_3d_world(
     write_gaussians(paths[2], x, gaussians)
     write_splat(paths[3], x, gaussians)
     return paths
+
+
+# Hidden states of particles of many clouds.
+
+DOT, DOT_SIGMA = 0.03, 0.7
+"""Size of a dot in a picture of states whose half width is 1, and its splat's deviation / size."""
+
+
+def in_the_plane(points: Tensor) -> Tensor:
+    """Return points [M, C] projected to the plane so that neighbours stay neighbours, [M, 2].
+
+    By UMAP where umap-learn is installed, else by scikit-learn's t-SNE, without either by the two
+    principal components.
+    """
+    values = points.detach().double().cpu()
+    try:
+        try:
+            from umap import UMAP
+
+            method = UMAP(n_jobs=1, random_state=0)
+        except ImportError:
+            from sklearn.manifold import TSNE
+
+            perplexity = min(30.0, (len(values) - 1) / 3)
+            method = TSNE(perplexity=perplexity, max_iter=500, init="pca", random_state=0)
+    except ImportError:
+        left, size, _ = torch.linalg.svd(values - values.mean(0), full_matrices=False)
+        return torch.mul(left, size)[:, :2].float()
+    return torch.from_numpy(method.fit_transform(values.numpy())).float()
+
+
+def film_states(
+    states: Tensor, label: Tensor, steps: Sequence[int], *, between: int = 6
+) -> tuple[list[Frame], list[Frame]]:
+    """Return a film of hidden states at T steps, [T, P, C], and those of its frames at the steps.
+
+    The states of P particles are projected to the plane, those of all steps at once; between two
+    steps are `between` frames of interpolated positions. Colours are those of the classes `label`
+    of the particles' clouds, [P], whose numbers stand at their medians in the last frame.
+    """
+    x = in_the_plane(states.flatten(0, 1))
+    low, high = x.aminmax(dim=0)
+    x = ((2.0 * x - low - high) / (high - low).max()).view(len(steps), -1, 2)
+    label, edge = label.cpu(), 1.0 + 2.0 * DOT
+    colour = class_colours(torch.nn.functional.one_hot(label).float())[None]
+    size: dict[str, Any] = {"resolution": SCREEN, "pixel_size": DOT, "lo": -edge, "hi": edge}
+    font: Any = ImageFont.load_default(SCREEN / 16)
+    frames = []
+    for count in range((len(steps) - 1) * (between + 1) + 1):
+        last, part = divmod(count, between + 1)
+        after = min(last + 1, len(steps) - 1)
+        now = torch.lerp(x[last], x[after], part / (between + 1))
+        frame = Image.fromarray(to_uint8(splat(now[None], colour, sigma=DOT_SIGMA, **size)[0]))
+        draw = ImageDraw.Draw(frame)
+        draw.text((4, 2), f"step {steps[last]}", "#333333", font)
+        for number in set(label.tolist()) if last == after else ():
+            across, up = (now[label == number].median(0).values / edge).tolist()
+            place = 0.5 * SCREEN * (1.0 + across), 0.5 * SCREEN * (1.0 - up)
+            draw.text(place, str(number), "black", font, "mm", stroke_width=2, stroke_fill="white")
+        frames.append(np.asarray(frame))
+    return frames, frames[:: between + 1]

@@ -20,7 +20,7 @@ from npa_envs.tasks.seeds import drawn_indices, drawn_worlds
 from npa_envs.tasks.targets.digit_clouds import PointClouds, Split, augmented, load_clouds
 from npa_envs.tasks.train_config import Common, TrainConfig, fast_run, presets_of, tiny_run
 from npa_envs.world.particles import Particles
-from npa_envs.world.randomness import Randomness
+from npa_envs.world.randomness import Randomness, normal_draws
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,6 +56,10 @@ class PointClassificationConfig(TaskConfig):
     """Probability that a damaged world from the pool gets the positions and class of another cloud
     and keeps its states (dimensionless)."""
 
+    cut_share: float = 0.0
+    """Probability that a damaged world from the pool has the quarter of its particles on a random
+    side moved out of sight of the others, and keeps its class (dimensionless)."""
+
     particle_count: Common[int] = 512
     """Particles in a world, N: points of a cloud."""
 
@@ -81,7 +85,7 @@ class PointClassificationConfig(TaskConfig):
         check_positive(self, int, "readout_hidden_dim")
         check_positive(self, int, "class_count", at_least=2)
         check_non_negative(self, "rotation", "jitter")
-        check_non_negative(self, "stretch", "mutated_share", at_most=1.0)
+        check_non_negative(self, "stretch", "mutated_share", "cut_share", at_most=1.0)
 
 
 SIGMA = 0.7
@@ -178,13 +182,23 @@ class PointClassification(ParticleTask[PointClassificationConfig]):
         return Particles(x, x.new_zeros(*x.shape[:2], config.state_dim), goal=goal)
 
     def damage(self, worlds: Particles, generator: Randomness) -> Particles:
-        """Return worlds; a fraction `mutated_share` of them gets another cloud and its class."""
-        x, probability = worlds.x, self.config.mutated_share
-        if worlds.goal is None or probability == 0.0:
-            return worlds
-        other = self.seed(len(x), generator=generator, device=x.device)
-        other = worlds._replace(x=other.x.to(x.dtype), goal=other.goal)
-        return other.where(drawn_worlds(x, generator, probability), worlds)
+        """Return worlds; some get another cloud and its class, of some a quarter is cut off.
+
+        The probabilities are `mutated_share` and `cut_share`.
+        """
+        x, mutated, cut = worlds.x, self.config.mutated_share, self.config.cut_share
+        if worlds.goal is not None and mutated > 0.0:
+            other = self.seed(len(x), generator=generator, device=x.device)
+            other = worlds._replace(x=other.x.to(x.dtype), goal=other.goal)
+            worlds = other.where(drawn_worlds(x, generator, mutated), worlds)
+        if cut > 0.0:
+            normal = torch.nn.functional.normalize(normal_draws(generator, (len(x), 2), x))[:, None]
+            height = worlds.x[..., :1] * normal[..., :1] + worlds.x[..., 1:] * normal[..., 1:]
+            bound = height.sort(dim=1).values[:, 3 * x.shape[1] // 4 :][:, :1]
+            # As far from the rest as if they were gone.
+            apart = worlds.x + 2.0 * self.eps * (height >= bound) * normal
+            worlds = worlds._replace(x=apart).where(drawn_worlds(x, generator, cut), worlds)
+        return worlds
 
     def outputs(self, s: Tensor) -> Tensor:
         """Return each particle's class scores, dimensionless, shape [B, N, K]."""

@@ -18,6 +18,8 @@ from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.base import Task
 from npa_envs.tasks.many_pictures import named_targets
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2D
+from npa_envs.tasks.targets.digit_clouds import data_path
+from npa_envs.tasks.targets.notes import left_out
 from npa_envs.training.task_table import override, preset, task_entry
 
 
@@ -45,7 +47,7 @@ def task_of_rule(
     2D morphogenesis with the rule's own sizes; a file of `npa-envs search` names the world that it
     was found in. A rule with codes for many pictures has the task of the picture `target`, else of
     the first one. Where the target is unknown or its picture is missing, a built-in target replaces
-    it, so that worlds can still be run and drawn.
+    it, and scikit-learn's digits a missing data set, so that worlds can still be run and drawn.
 
     Args:
         source: The name or file that the rule was loaded from.
@@ -77,26 +79,46 @@ def task_of_rule(
     config = override(config, **{k: v for k, v in fields.items() if v is not None})
     if particle_count is not None:
         config = override(config, task=config.task.with_particle_count(particle_count))
-    chosen = fields.get("target") is not None
+    chosen = any(fields.get(name) is not None for name in ("target", "data", "data_folder"))
     if rule.codes is not None:
         # The chosen picture or the first one, from its source.
-        name = config.task.target if chosen else rule.codes.names[0]
+        name = rule.codes.names[0] if fields.get("target") is None else config.task.target
         named = _named(config.task.targets).get(name, name)
         config = override(config, targets=(), target=named)
     why_not_measurable = None if known or chosen else "its file does not say what it grows"
     try:
+        _check_data(config.task)
         task = entry.make(config.task, device).held_out().for_rule(rule)
     except NPAError as error:
-        if chosen or not entry.targets():
+        clouds = getattr(config.task, "class_count", 0) >= 10  # as scikit-learn's digits
+        name, known_names = ("data", ("digits",)) if clouds else ("target", entry.targets())
+        if chosen or not known_names:
             raise
-        why_not_measurable = f"its target cannot be loaded: {error}"
-        config = override(config, target=entry.targets()[0])
-        task = entry.make(config.task, device)
+        if clouds:
+            left_out(source, str(error), what="scikit-learn's digits instead")
+        why_not_measurable = f"its {name} cannot be loaded: {error}"
+        config = override(config, **{name: known_names[0]})
+        task = entry.make(config.task, device).held_out()
         if rule.codes is not None:
             target = replace(cast(Morphogenesis2D, task).target, name=rule.codes.names[0])
             task = Morphogenesis2D(config.task, target=target, device=device)
         task = task.for_rule(rule)
     return TrainedTask(task, why_not_measurable, task_name)
+
+
+def _check_data(config: Any) -> None:
+    """Raise NPAError if the data set of a task's configuration is not there."""
+    if getattr(config, "data", "digits") != "digits":
+        data_path(config.data, config.data_folder)
+
+
+def has_data(source: str) -> bool:
+    """Return whether the data set that a rule was trained on is there; True for other tasks."""
+    path, metadata = _file_of(source)
+    with contextlib.suppress(NPAError):
+        _check_data(trained_config(path, metadata).task if "config" in metadata else None)
+        return True
+    return False
 
 
 def trained_task_name(source: str) -> str:

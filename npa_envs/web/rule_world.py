@@ -149,9 +149,10 @@ class RuleWorld(LiveWorld):
     def describe(self) -> WorldEvent:
         """Return the event "world", all its fields."""
         frame, goal = self.task.frame, self._goal if self.task.classifies else None
+        others = " of scikit-learn's digits" if self.trained.why_not_measurable else ""
         return super().describe() | {
             "title": self.main.name,
-            "note": "" if goal is None else f"class {int(goal)}",
+            "note": "" if goal is None else f"class {int(goal)}{others}",
             "dimension": self.main.rule.space_dim,
             "half_width": frame.half_width,
             "centre": list(frame.centre),

@@ -48,7 +48,8 @@ def test_a_run_of_every_task_ends_with_a_model_card_of_each_rule(task, tmp_path,
     for rule in rules:
         stem = rule.stem
         expected |= {stem + end for end in (".md", ".json", ".gif", ".mp4", "-filmstrip.png")}
-        expected |= set() if task == "point_classification" else {f"{stem}-target.png"}
+        extra = ("states.gif", "states.png") if task == "point_classification" else ("target.png",)
+        expected |= {f"{stem}-{name}" for name in extra}
         card = (run / "report" / f"{stem}.md").read_text("utf-8")
         held = json.loads((run / "report" / f"{stem}.json").read_text("utf-8"))
         assert "npa-envs train" in card
@@ -57,6 +58,7 @@ def test_a_run_of_every_task_ends_with_a_model_card_of_each_rule(task, tmp_path,
         assert f"Commit {held['commit']}" in card
         assert held["command"] in card
         clouds = task == "point_classification"
+        assert ("projected to the plane, by class.](" in card) is clouds
         rows = held["accuracy" if clouds else "growth"]
         assert [row["step"] for row in rows] == ([8, 32] if clouds else [8, 128])
         for row in rows:

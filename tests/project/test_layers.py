@@ -48,7 +48,9 @@ LAYERS = {
     "npa_envs.rule": Layer(5, "torch safetensors", never=INSIDES),
     "npa_envs.world": Layer(6, "torch", never=ORACLES),
     "npa_envs.tasks": Layer(7, "torch numpy PIL sklearn trimesh scipy pillow_heif", never=ORACLES),
-    "npa_envs.render": Layer(8, "torch numpy PIL imageio imageio_ffmpeg pygame", never=ORACLES),
+    "npa_envs.render": Layer(
+        8, "torch numpy PIL imageio imageio_ffmpeg pygame sklearn umap", never=ORACLES
+    ),
     "npa_envs.training": Layer(9, "torch numpy tqdm yaml tensorboard", never=ORACLES),
     "npa_envs": Layer(10, COMPUTED_NAME, never=ORACLES),
     "npa_envs.measure.benchmark_records": Layer(3, "torch", never=INSIDES),

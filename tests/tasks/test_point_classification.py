@@ -1,7 +1,11 @@
 """Self-classifying point clouds: task, goals that stay with their worlds, training, measures."""
 
 import json
+import sys
+from dataclasses import asdict
+from types import SimpleNamespace
 
+import numpy as np
 import pytest
 import torch
 from support.training_runs import make_cycle
@@ -9,7 +13,15 @@ from support.worlds import seeded
 
 from npa_envs.cli import main
 from npa_envs.errors import NPAError
-from npa_envs.measure.quality import _chimera, _cut, _partners, accuracies, changes_of_mind
+from npa_envs.measure.quality import (
+    _chimera,
+    _cut,
+    _partners,
+    accuracies,
+    changes_of_mind,
+    hidden_states,
+)
+from npa_envs.render.world_film import film_states, in_the_plane
 from npa_envs.rule.files import load_rule, save_rule
 from npa_envs.tasks.point_classification import (
     PALETTE,
@@ -20,6 +32,7 @@ from npa_envs.tasks.point_classification import (
     majority,
 )
 from npa_envs.training import preset, train
+from npa_envs.training.task_of_rule import has_data, task_of_rule
 from npa_envs.world.particles import Particles
 from npa_envs.world.rollout import rollout
 
@@ -165,6 +178,23 @@ def test_mutated_worlds_keep_their_states(folder):
     assert_goals_fit(new_x, new_goal, task.clouds)
 
 
+def test_a_quarter_on_one_side_is_moved_out_of_sight_of_the_rest(folder, device):
+    task = task_of(folder, device, cut_share=0.5)
+    worlds = task.seed(200, generator=seeded(1, device), device=device)
+    cut = task.damage(worlds, seeded(2, device))
+    assert torch.equal(cut.goal, worlds.goal)
+    assert torch.equal(cut.s, worlds.s)
+    away = torch.linalg.vector_norm(cut.x - worlds.x, dim=-1)
+    moved = away > 0.0
+    hit = moved.any(1)
+    # Half of 200: 100 ± 7.
+    assert 65 < int(hit.sum()) < 135
+    assert (moved.sum(1)[hit] == 6).all()
+    torch.testing.assert_close(away[moved], torch.full_like(away[moved], 2.0 * task.eps))
+    apart = torch.cdist(cut.x, cut.x)[moved[:, :, None] & ~moved[:, None] & hit[:, None, None]]
+    assert float(apart.min()) > task.eps
+
+
 def test_accuracies_are_those_of_a_rollout(folder, device):
     task = task_of(folder, device, readout_hidden_dim=5, update_prob=1.0).held_out()
     rule = task.make_rule(seeded(3))
@@ -256,3 +286,93 @@ def test_a_static_rule_of_no_known_task_is_refused(task, tmp_path, capsys):
     assert main(["evaluate", str(path), "--no-progress"]) != 0
     message = "runs moving rules in the 2D worlds of morphogenesis2d, got space_dim=2, static=True"
     assert message in capsys.readouterr().err
+
+
+def test_a_rule_without_its_data_runs_on_built_in_digits_and_is_not_measured(
+    folder, tmp_path, capsys
+):
+    pytest.importorskip("sklearn")
+    config = PointClassificationConfig(data="mnist", **SMALL | {"class_count": 10})
+    rule, path = PointClassification(config).make_rule(seeded()), tmp_path / "rule.safetensors"
+    stored = {"task": "point_classification", "config": json.dumps({"task": asdict(config)})}
+    save_rule(rule, path, metadata=stored)
+    assert not has_data(str(path))
+    assert has_data("digits")
+    assert has_data("gecko")
+    device = torch.device("cpu")
+    trained = task_of_rule(str(path), rule, device)
+    assert trained.task.config.data == "digits"
+    assert trained.task.split == "test"
+    assert "MNIST is not in the folder 'data'" in trained.why_not_measurable
+    assert main(["evaluate", str(path), "--no-progress"]) == 2
+    assert "or name its folder: give --data\n" in capsys.readouterr().err
+    with pytest.raises(NPAError, match="data must be a known data set or a folder"):
+        task_of_rule(str(path), rule, device, data="nowhere")
+    chosen = task_of_rule(str(path), rule, device, data=str(folder))
+    assert chosen.why_not_measurable is None
+    assert len(chosen.task.clouds.label) == 18
+
+
+# Pictures of hidden states.
+
+
+def test_hidden_states_are_those_of_a_rollout(folder):
+    task = task_of(folder, readout_hidden_dim=5, update_prob=1.0).held_out()
+    rule = task.make_rule(seeded(3))
+    states, label = hidden_states(rule, task, steps=(1, 4), cloud_count=2, particle_count=4)
+    assert label.tolist() == [0] * 8 + [1] * 8 + [2] * 8
+    chosen = [torch.nonzero(task.clouds.label == kind)[:2, 0] for kind in range(3)]
+    x = task.clouds.x[torch.cat(chosen)]
+    s = x.new_zeros(6, 24, 6)
+    for steps, now in zip((1, 3), states, strict=True):
+        _, s = rollout(rule, x, s, steps, eps=task.eps, update_prob=1.0)
+        torch.testing.assert_close(now, s[:, ::6].flatten(0, 1))
+
+
+GROUPS = torch.arange(3).repeat_interleave(20)
+
+
+def two_steps():
+    """Return states of three groups, first all alike, then far from each other."""
+    noise = 0.01 * torch.randn(2, 60, 5, generator=seeded())
+    return noise + torch.stack((torch.zeros(60, 5), torch.eye(5)[GROUPS]))
+
+
+@pytest.mark.parametrize("method", ["t-SNE", "components"])
+def test_states_of_a_group_are_neighbours_in_the_plane(method, monkeypatch):
+    monkeypatch.setitem(sys.modules, "umap", None)
+    if method == "t-SNE":
+        pytest.importorskip("sklearn")
+    else:
+        monkeypatch.setitem(sys.modules, "sklearn.manifold", None)
+    place = in_the_plane(two_steps()[1])
+    away = torch.cdist(place, place) + 1e9 * torch.eye(60)
+    assert torch.equal(GROUPS[away.argmin(1)], GROUPS)
+    assert torch.equal(place, in_the_plane(two_steps()[1]))
+
+
+def test_umap_is_taken_where_it_is_installed_and_films_show_classes_draw_together(monkeypatch):
+    made = []
+
+    class UMAP:
+        """Takes two coordinates."""
+
+        def __init__(self, **options):
+            made.append(options)
+
+        def fit_transform(self, values):
+            return values[:, :2]
+
+    monkeypatch.setitem(sys.modules, "umap", SimpleNamespace(UMAP=UMAP))
+    states = two_steps()
+    frames, strip = film_states(states, GROUPS, (2, 9), between=3)
+    assert made == [{"n_jobs": 1, "random_state": 0}]
+    assert len(frames) == 5
+    assert np.array_equal(strip, [frames[0], frames[4]])
+    inked = [(frame.min(axis=2) < 200).nonzero() for frame in strip]
+    # Below the text the dots are at one place, then in two corners.
+    before, after = (np.ptp(columns[rows > 48]) for rows, columns in inked)
+    assert before < 80 < 160 < after
+    # The last frame has names where the dots are.
+    pure, mixed = (np.abs(frames[k] - np.array([230.0, 26.0, 74.0])).max(2).min() for k in (3, 0))
+    assert pure < 30 < 60 < mixed

@@ -245,6 +245,20 @@ def load_pictures(
     """
     if data == "digits":
         return _digits(split)
+    path = data_path(data, folder)
+    images, labels = (read_idx(_idx_file(path, name)) for name in IDX_NAMES[split])
+    if images.ndim != 3 or labels.shape != images.shape[:1] or images.size == 0:
+        raise NPAError(
+            f"the {split} files of {shown(str(path))} must hold pictures [M, H, W] and classes "
+            f"[M], got {list(images.shape)} and {list(labels.shape)}: download them again"
+        )
+    # By a table: the quotients themselves would take eight bytes per pixel.
+    ink = (np.arange(256) / 255.0).astype(np.float32)
+    return ink[images], labels.astype(np.int64)
+
+
+def data_path(data: str, folder: str = "data") -> Path:
+    """Return the folder of a data set's IDX files; raise NPAError if there is none."""
     path = home_path(folder) / "MNIST" / "raw" if data == "mnist" else home_path(data)
     if data == "mnist" and not os.path.isdir(path):
         raise NPAError(
@@ -256,15 +270,7 @@ def load_pictures(
             f"data must be a known data set or a folder of IDX files, got {shown(data)}: "
             f"{suggest(data, BUILT_IN)}"
         )
-    images, labels = (read_idx(_idx_file(path, name)) for name in IDX_NAMES[split])
-    if images.ndim != 3 or labels.shape != images.shape[:1] or images.size == 0:
-        raise NPAError(
-            f"the {split} files of {shown(str(path))} must hold pictures [M, H, W] and classes "
-            f"[M], got {list(images.shape)} and {list(labels.shape)}: download them again"
-        )
-    # By a table: the quotients themselves would take eight bytes per pixel.
-    ink = (np.arange(256) / 255.0).astype(np.float32)
-    return ink[images], labels.astype(np.int64)
+    return path
 
 
 def read_idx(path: Path) -> NDArray[np.uint8]:
