@@ -173,9 +173,9 @@ def test_an_opaque_photograph_is_refused_with_its_cure(tmp_path):
 @pytest.mark.parametrize(
     ("name", "content", "error"),
     [
-        ("dropped", b"no picture", "must be a picture"),
+        ("dropped", b"no picture", r"must be a 3D file \(\.glb.*\) or a picture \(PNG"),
         ("dropped", png()[:-60], "truncated or damaged"),
-        ("dropped", png(size=(8, 8)).replace(b"IHDR", b"IHDX"), "must be a picture|truncated"),
+        ("dropped", png(size=(8, 8)).replace(b"IHDR", b"IHDX"), "or a picture|truncated"),
         ("emoji.txt", b"gecko", "one picture symbol, got 'gecko'"),
         ("emoji.txt", b"\xff\xfe", "picture symbol|colour-emoji font|an installed font|one emoji"),
         ("emoji.txt", "/\U0001f98a".encode(), "one picture symbol"),
