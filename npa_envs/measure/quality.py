@@ -7,7 +7,7 @@ import itertools
 import json
 import statistics
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, cast
 
 import torch
@@ -17,6 +17,7 @@ from npa_envs.checks import check_device
 from npa_envs.errors import NPAError, check_known
 from npa_envs.measure.texture_metric import TextureMetric, TextureRow
 from npa_envs.measure.wounds import WoundRow, wound_rows, wounded
+from npa_envs.render.colours import to_uint8
 from npa_envs.rule.files import shipped_rules
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.base import Task
@@ -36,6 +37,9 @@ FIRST_SEED = 1_000_000
 
 CHECKPOINTS = (64, 128, 256, 512, 1024, 2048, 4096)
 """Default steps from the start at which worlds are measured."""
+
+WHITE_SIDE = 256
+"""Side of the pictures that `psnr_on_white` compares [pixels]."""
 
 DIVERGED_FACTOR = 10.0
 """A damaged world has diverged if its last loss exceeds this multiple of that before the damage."""
@@ -149,6 +153,23 @@ def psnr(picture: Tensor, target: Tensor) -> Tensor:
     """Return the PSNR [dB], [B], of pictures [B, R, R, 4] to a target, all clipped to [0, 1]."""
     error = (picture.clamp(0.0, 1.0) - target.clamp(0.0, 1.0)).square().flatten(1).mean(1)
     return -10.0 * torch.log10(error)
+
+
+@torch.no_grad()
+def psnr_on_white(task: Task, x: Tensor, s: Tensor) -> Tensor:
+    """Return the PSNR [dB] of worlds to their target, both drawn on white, shape [B].
+
+    In 2D the world's mean is moved to the target's, and pictures have 256 pixels on each side; in
+    3D it is the mean over the task's held-out views.
+    """
+    if task.has_views:
+        return cast(Morphogenesis3D, task).view_psnr(x, s)
+    flat = cast(Morphogenesis2D, task)
+    config = replace(flat.config, resolution=WHITE_SIDE)
+    fine = Morphogenesis2D(config, target=flat.target, device=x.device)
+    pictures = torch.cat((fine.picture(x, s), fine.target_picture[None]))
+    rgb = torch.from_numpy(to_uint8(pictures)) / 255.0
+    return psnr(rgb[:-1], rgb[-1:])
 
 
 @torch.no_grad()

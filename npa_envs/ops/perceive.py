@@ -32,6 +32,7 @@ from npa_envs.ops.perception_passes import (
     perception_launch,
     portable_kernels,
     saved_together,
+    search_threads,
 )
 from npa_envs.ops.physics import ALL_TERMS, Physics, Terms, make_physics
 from npa_envs.ops.position_check import checked_positions
@@ -225,7 +226,7 @@ def _gather_fields(x: Tensor, s: Tensor, physics: Physics) -> list[Tensor]:
     ]
     launch(
         kernels.gather_fields,
-        (-(-plan.total // kernels.together), plan.group_count),
+        (search_threads(plan.total, plan.on_cpu), plan.group_count),
         x.device,
         plan.domain,
         particle_count,

@@ -138,7 +138,7 @@ def compute_densities_in_cells(
     kernels = density_kernels(plan.space_dim, plan.scalar, plan.on_cpu)
     launch(
         kernels.compute_density,
-        -(-plan.total // kernels.together),
+        search_threads(plan.total, plan.on_cpu),
         positions.device,
         plan.domain,
         plan.particle_count,
@@ -153,9 +153,9 @@ def compute_densities_in_cells(
     return Densities(particles, density_gradient)
 
 
-def perception_threads(row_count: int) -> int:
-    """Return the first size of `perception_launch` for some rows on a CPU."""
-    return -(-row_count // PARTICLES)
+def search_threads(count: int, on_cpu: bool) -> int:
+    """Return how many threads search the neighbours of some particles, in portable kernels."""
+    return -(-count // PARTICLES) if on_cpu else count
 
 
 def perception_launch(
@@ -203,7 +203,7 @@ def perception_launch(
         kernels = portable_kernels(plan, neighbours is not None)
         return (
             kernels.perceive,
-            (-(-row_count // kernels.together), group_count),
+            (search_threads(row_count, plan.on_cpu), group_count),
             out.device,
             plan.domain,
             plan.particle_count,
@@ -379,7 +379,7 @@ def _pull_back(
     rows = saved.row_of, saved.row_positions, saved.row_kernel_sum
     launch(
         kernels.gather_state_cotangents,
-        (-(-plan.total // kernels.together), group_count),
+        (search_threads(plan.total, plan.on_cpu), group_count),
         bar.device,
         plan.domain,
         plan.particle_count,

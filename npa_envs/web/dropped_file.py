@@ -77,7 +77,8 @@ def read_dropped(path: Path, *, whole: bool = False) -> None:
             )
         image = render_emoji(text)
     else:
-        image, line = read_image(path, keep_background=whole)
+        kind = f"3D file ({', '.join(MESH_SUFFIXES)}) or a picture"
+        image, line = read_image(path, keep_background=whole, kind=kind)
         print(line)
         image = with_background(image) if whole else image
     image.thumbnail((MAX_SIDE, MAX_SIDE), Image.Resampling.LANCZOS)
@@ -124,8 +125,6 @@ def main(arguments: Sequence[str]) -> int:
         read_dropped(path, whole="whole" in arguments[1:])
     except (NPAError, MemoryError) as error:
         message = str(error) or f"reading it takes more than {MEMORY >> 30} GiB: reduce it"
-        kinds = f"must be a 3D file ({', '.join(MESH_SUFFIXES)}) or a picture"
-        message = message.replace("must be a picture", kinds)
         print(f"npa-envs: error: {' '.join(message.split())}")
         return 2
     return 0

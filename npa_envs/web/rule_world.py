@@ -207,7 +207,8 @@ class RuleWorld(LiveWorld):
             "noise": Range(0.0, 0.2 * eps0),
         }
         if not self.task.classifies:
-            ranges["count"] = Range(64, MAX_PARTICLES[self._device.type], "log", whole=True)
+            most_particles = max(MAX_PARTICLES[self._device.type], self.count)
+            ranges["count"] = Range(64, most_particles, "log", whole=True)
         return ranges
 
     def _shows(self) -> list[str]:

@@ -10,21 +10,15 @@ import subprocess
 import sys
 import threading
 import time
-from dataclasses import replace
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import torch
-from torch import Tensor
 
 from npa_envs.atomic_files import made_folder, read_json, write_bytes
 from npa_envs.errors import NPAError
 from npa_envs.measure.process_queue import PARENT_GRACE, PARENT_PIPE
-from npa_envs.measure.quality import psnr
-from npa_envs.render import to_uint8
-from npa_envs.tasks.base import Task
-from npa_envs.tasks.morphogenesis2d import Morphogenesis2D
-from npa_envs.tasks.morphogenesis3d import Morphogenesis3D
+from npa_envs.measure.quality import psnr_on_white
 from npa_envs.training.run_folder import JsonlLog, RunFolder
 from npa_envs.training.task_table import task_entry
 from npa_envs.web.dropped_file import EMOJI, MAX_BYTES, PICTURE, READ_SECONDS, stored_name
@@ -241,9 +235,6 @@ class Training:
 
 # The world of a training.
 
-WHITE_SIDE = 256
-"""Side of the pictures that are compared [pixels]."""
-
 GROWN = 96
 """Age from which a world is compared with its picture [steps]."""
 
@@ -284,24 +275,7 @@ class LearningWorld(RunWorld):
             self.reset(self.seed)
         if self.step < GROWN or not self._is_unchanged():
             return
-        value = round(float(psnr_on_white(self.task, *self.particles[:2])), 1)
+        value = round(float(psnr_on_white(self.task, *self.particles[:2]).mean()), 1)
         if value != self._psnr:
             self._psnr = value
             self._events.append({"type": "psnr", "value": value})
-
-
-@torch.no_grad()
-def psnr_on_white(task: Task, x: Tensor, s: Tensor) -> Tensor:
-    """Return the mean PSNR [dB], [], of worlds to their target, both drawn on white.
-
-    In 2D the world's mean is moved to the target's, and pictures have 256 pixels on each side; in
-    3D it is that of the task's held-out views.
-    """
-    if task.has_views:
-        return cast(Morphogenesis3D, task).view_psnr(x, s).mean()
-    flat = cast(Morphogenesis2D, task)
-    config = replace(flat.config, resolution=WHITE_SIDE)
-    fine = Morphogenesis2D(config, target=flat.target, device=x.device)
-    pictures = torch.cat((fine.picture(x, s), fine.target_picture[None]))
-    rgb = torch.from_numpy(to_uint8(pictures)) / 255.0
-    return psnr(rgb[:-1], rgb[-1:]).mean()

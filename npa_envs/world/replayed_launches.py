@@ -20,7 +20,7 @@ from torch.utils._python_dispatch import is_in_torch_dispatch_mode
 from npa_envs.ops.custom_op import once_differentiable
 from npa_envs.ops.launch import RecordedLaunches
 from npa_envs.ops.perceive import Rows, saved_perception
-from npa_envs.ops.perception_passes import perceive_rows_backward, perception_threads
+from npa_envs.ops.perception_passes import perceive_rows_backward, search_threads
 from npa_envs.ops.sort import sorts_at_once
 from npa_envs.ops.update import update_particles, update_particles_backward
 from npa_envs.rule.folded_network import FoldedRule, layers_backward, run_layers, without_small
@@ -126,7 +126,7 @@ class ReplayedSteps:
                 self.steps.append(_ReplayedStep(step, before, self._mask, self.bars))
             own = self.steps[number if self.bars is not None else number % 2]
             count = max(sum(counts), 1)
-            own.forward.replay(0, own.split, last_count=perception_threads(count))
+            own.forward.replay(0, own.split, last_count=search_threads(count, on_cpu=True))
             own.update[:count].copy_(network(own.rows[:count], counts))
             if noise is not None:
                 own.x.add_(noise)

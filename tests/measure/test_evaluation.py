@@ -36,6 +36,17 @@ def test_psnr_of_known_errors():
     assert values == [pytest.approx(6.0206, abs=1e-4), pytest.approx(20.0, abs=1e-4), math.inf]
 
 
+def test_the_psnr_on_white_is_that_of_each_world_and_largest_for_the_target_itself():
+    task = TASKS["morphogenesis2d"].make(preset("tiny", target="heart").task, torch.device("cpu"))
+    points, colours = task.target.points[None], task.target.colours[None]
+    s = torch.cat((torch.zeros(1, points.shape[1], 13), colours - 0.5), dim=-1)
+    x, s = torch.cat((points, points, 3.0 * points)), torch.cat((s, torch.zeros_like(s), s))
+    own, blank, large = npa_envs.measure.quality.psnr_on_white(task, x, s).tolist()
+    assert own > 60
+    assert blank < 20
+    assert large < 12
+
+
 def test_rule_that_does_nothing_leaves_the_seed_at_every_checkpoint():
     task = CircleTask()
     rows = evaluate(make_rule(0.0), task, checkpoints=[1, 3], seeds=[5, 6, 7])

@@ -8,11 +8,30 @@ const folder = process.argv[2];
 const load = (name) => import(pathToFileURL(`${folder}/${name}`));
 const { Physics, padded, plainKernels, prepareRule } = await load("physics.js");
 const { simdKernels } = await load("kernels_simd.js");
-const { RuleWorld } = await load("rule_world.js");
+const { RuleWorld, serve } = await load("rule_world.js");
 const { Colouring } = await load("colours.js");
 
 const floats = (text) => new Float32Array(Uint8Array.from(Buffer.from(text, "base64")).buffer);
 const text = (array) => Buffer.from(array.buffer, array.byteOffset, array.byteLength).toString("base64");
+
+// Makes helpers of live worlds, in this process, of a processor with so many threads; `asked` counts what they are asked.
+function startHelpers(threads, fail) {
+  const helpers = { asked: 0 };
+  Object.defineProperty(globalThis, "navigator", { value: { hardwareConcurrency: threads }, configurable: true });
+  globalThis.Worker = class {
+    constructor() {
+      this.scope = { postMessage: (data) => this.onmessage({ data: structuredClone(data) }) };
+      serve(this.scope);
+    }
+
+    postMessage(message) {
+      helpers.asked++;
+      const data = structuredClone(message);
+      queueMicrotask(() => (fail ? this.onerror({ preventDefault() {} }) : this.scope.onmessage({ data })));
+    }
+  };
+  return helpers;
+}
 
 const acts = {
   // One step of rules with given masks.
@@ -42,7 +61,8 @@ const acts = {
   },
 
   // A live world: what it sends on messages and on going on.
-  async live({ settings, script }) {
+  async live({ settings, script, threads = 1, fail = false }) {
+    const helpers = startHelpers(threads, fail);
     const events = [];
     const errors = [];
     const live = new RuleWorld(settings, (event) => events.push(event));
@@ -60,6 +80,7 @@ const acts = {
     }
     return {
       errors,
+      asked: helpers.asked,
       events: events.map((event) =>
         event.type === "frame" ? { ...event, positions: text(event.positions), colours: [...event.colours] } : event,
       ),

@@ -109,6 +109,32 @@ def test_a_live_world_moves_and_the_same_seed_gives_the_same_world(run, settings
     assert live(run, settings, {"type": "reset", "seed": 0}, ADVANCE, ADVANCE)["x"] == first["x"]
 
 
+@pytest.fixture(scope="module")
+def crowds():
+    """Settings of worlds that are large enough to be shared with helpers."""
+    rules = ("gecko", "heart", "dots", "duck")
+    return settings_of(*(page_rule(name, particle_count=2304) for name in rules)) | {"code": ";"}
+
+
+@pytest.mark.parametrize("rule", ["gecko", "dots", "duck"])
+def test_helpers_change_no_bit_of_a_world(run, crowds, rule):
+    at = [0.0] * (3 if rule == "duck" else 2)
+    graft = {"type": "brush", "tool": "graft", "at": at, "radius": 0.1, "strength": 1.0}
+    start = {"type": "set", "name": "rule", "value": rule}
+    script = [start, ADVANCE, ADVANCE, graft | {"rule": GRAFTED[rule]}, ADVANCE]
+    runs = [
+        run("live", settings=crowds, script=script, threads=threads, fail=fail)
+        for threads, fail in ((1, False), (4, False), (8, False), (8, True))
+    ]
+    assert [one["asked"] for one in runs] == [0, 3, 9, 3], "a helper that fails is not asked again"
+    assert all(one[field] == runs[0][field] for one in runs for field in ("x", "s", "errors"))
+
+
+def test_a_page_may_have_as_many_particles_as_it_was_asked_for():
+    world = page_rule("gecko", particle_count=20_000)["world"]
+    assert world["count"] == world["settings"]["count"]["high"] == 20_000
+
+
 PAUSE = {"type": "play", "on": False}
 BRUSHES = {
     "wipe": {}, "remove": {}, "clump": {},

@@ -90,6 +90,28 @@ def test_a_page_records_a_film_and_a_picture(exported):
 
 
 @pytest.mark.slow
+def test_helpers_of_a_page_run_in_a_browser(new_page, tmp_path):
+    positions = []
+    for threads in (1, 8):
+        path = tmp_path / f"{threads}.html"
+        export_web(["gecko"], path, particle_count=2304)
+        text = path.read_text("utf-8").replace("navigator.hardwareConcurrency", str(threads))
+        path.write_text(text, encoding="utf-8")
+        page = new_page()
+        page.open(path.as_uri() + "?engine=processor")
+        page.wait(f"document.page?.frame && {STEP} >= 1")
+        reset, step = "{ type: 'reset', seed: 3 }", "{ type: 'step' }"
+        for message in ("{ type: 'play', on: false }", reset, step, step, step):
+            page.run(f"document.page.send({message})")
+        page.wait(f"document.page.world.seed === 3 && {STEP} === 3", 60)
+        workers = page.call("Target.getTargets")["targetInfos"]
+        assert sum(target["type"] == "worker" for target in workers) == (4 if threads > 1 else 1)
+        positions.append(page.run("[...document.page.frame.positions]"))
+        page.open("about:blank")
+    assert positions[0] == positions[1]
+
+
+@pytest.mark.slow
 def test_a_gallery_opens_a_rule_and_goes_back(exported):
     page = exported("gecko", "dots", particle_count=256, previews=True, size=PHONE, steps=0)
     shown = "[...document.querySelectorAll('#gallery img')].filter((image) => image.naturalWidth)"

@@ -48,7 +48,6 @@ def adjoint_kernels(
     space = group_types(space_dim, scalar, width)
     search = make_search(space_dim, scalar, space.vector, on_cpu, listed, of_rows=True)
     return SimpleNamespace(
-        together=search.together,
         unscale_cotangents=unscaling_kernel(space, module, state_gradient),
         gather_state_cotangents=state_kernel(space, module, state_gradient, search),
         gather_density_cotangents=density_kernel(space, module, state_gradient),

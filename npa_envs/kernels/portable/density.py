@@ -19,7 +19,7 @@ from npa_envs.kernels.portable.search import lowest_bit, make_search
 
 @cached_under_lock()
 def density_kernels(space_dim: int, scalar: type, on_cpu: bool) -> SimpleNamespace:
-    """Return the kernels; a thread of `compute_density` serves `together` particles."""
+    """Return the kernels of densities by name."""
     space = domain_types(space_dim, scalar)
     vector, particle, Domain = space.vector, space.particle, space.Domain
     vector_f64 = space.vector_f64
@@ -174,7 +174,7 @@ def density_kernels(space_dim: int, scalar: type, on_cpu: bool) -> SimpleNamespa
                     near = near & (near - wp.uint32(1))
         counts[k] = next_entry - begin_list
 
-    return namespace(locals(), together=together)
+    return namespace(locals())
 
 
 @cached_under_lock()

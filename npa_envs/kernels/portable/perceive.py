@@ -258,4 +258,4 @@ def perception_kernels(
                 density[i] = scalar(1.0) / particles[k][wp.static(space_dim)]
                 moment_field[i] = moment
 
-    return SimpleNamespace(perceive=perceive, gather_fields=gather_fields, together=together)
+    return SimpleNamespace(perceive=perceive, gather_fields=gather_fields)

@@ -69,12 +69,15 @@ _SIGNED, _FLOAT = 2, 3  # of _SAMPLE_FORMAT
 _NATIVE_MODES = {"F;32BF": "F;32NF", "I;32BS": "I;32NS", "I;16BS": "I;16NS"}
 
 
-def read_image(path: Path, *, keep_background: bool = False) -> tuple[Image.Image, str]:
+def read_image(
+    path: Path, *, keep_background: bool = False, kind: str = "picture"
+) -> tuple[Image.Image, str]:
     """Read a picture as RGBA, and return it with a line about what was read.
 
-    The background of one without transparency is made transparent, unless it is kept.
+    The background of one without transparency is made transparent, unless it is kept. `kind`: what
+    the file must be, for the error that it is something else.
     """
-    opened = open_image(path)
+    opened = open_image(path, kind=kind)
     if keep_background:
         return opened, summary_of(path.name, opened, "its whole rectangle")
     image, how = opened, "cut out by alpha"
@@ -110,14 +113,14 @@ def with_background(image: Image.Image) -> Image.Image:
     return Image.alpha_composite(white, image)
 
 
-def open_image(path: Path, *, upright: bool = True) -> Image.Image:
+def open_image(path: Path, *, upright: bool = True, kind: str = "picture") -> Image.Image:
     """Read a picture as RGBA, as it is; turned as its EXIF data say, unless not `upright`."""
     content = read_bytes(path, limit=_MAX_FILE, what="target")
-    return decode_image(content, label=str(path), upright=upright)
+    return decode_image(content, label=str(path), upright=upright, kind=kind)
 
 
 def decode_image(
-    content: bytes, *, label: str, upright: bool = True, profile: bool = True
+    content: bytes, *, label: str, upright: bool = True, profile: bool = True, kind: str = "picture"
 ) -> Image.Image:
     """Return the picture in the bytes of a file as RGBA, as it is; errors call it `label`.
 
@@ -143,7 +146,7 @@ def decode_image(
         if content[:4] in (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"):
             what = "a TIFF of a kind that Pillow does not read, or damaged"
         raise NPAError(
-            f"target {name} must be a picture ({', '.join(FORMATS)}, AVIF, HEIC), "
+            f"target {name} must be a {kind} ({', '.join(FORMATS)}, AVIF, HEIC), "
             f"but its content is {what}: save it as PNG"
         ) from error
     except NPAError:

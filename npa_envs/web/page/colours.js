@@ -2,6 +2,7 @@
 // npa_envs/web/live_world.py; test_particles_have_the_colours_of_the_viewer of tests/web/test_export.py compares all.
 
 import { inner } from "./brushes.js";
+import { padded } from "./physics.js";
 
 const ROWS_TOGETHER = 64;
 const JACOBI_SWEEPS = 12;
@@ -120,22 +121,23 @@ export class RuleColours {
     this.second = kernels.makeLayer(
       weights["readout.2.weight"].slice((outputs - width) * hidden), weights["readout.2.bias"].slice(outputs - width), hidden, width,
     );
-    this.rows = kernels.floats(ROWS_TOGETHER * this.channels);
+    this.width = padded(this.channels);
+    this.rows = kernels.floats(ROWS_TOGETHER * this.width);
     this.hidden = kernels.floats(ROWS_TOGETHER * this.first.width);
     this.results = kernels.floats(ROWS_TOGETHER * this.second.width);
   }
 
   // Writes red, green and blue of the particles of species `number` to `bytes`.
   write({ s, species, count }, number, bytes) {
-    const { channels } = this;
+    const { channels, width } = this;
     if (this.first === undefined) {
       for (let i = 0; i < count; i++) if (species[i] === number) writeColour(bytes, i, this.tint(s, i * channels));
       return;
     }
     const block = [];
     const flush = () => {
-      block.forEach((i, row) => this.rows.set(s.subarray(i * channels, (i + 1) * channels), row * channels));
-      this.kernels.applyLayer(this.first, block.length, this.rows, channels, this.hidden, true);
+      block.forEach((i, row) => this.rows.set(s.subarray(i * channels, (i + 1) * channels), row * width));
+      this.kernels.applyLayer(this.first, block.length, this.rows, width, this.hidden, true);
       this.kernels.applyLayer(this.second, block.length, this.hidden, this.first.width, this.results, false);
       block.forEach((i, row) => writeColour(bytes, i, this.tint(this.results, row * this.second.width)));
       block.length = 0;

@@ -2,21 +2,18 @@
 // npa_envs/reference.py and docs/mathematics.md. A change of a formula is made in its whole row:
 //
 //                          this file            kernels_simd.js       shaders of physics_gpu.js
-//   density                computeDensities                           density
+//   density                sumDensities         sumDensitiesCode      density
 //   list of neighbours     listNeighbours       listNeighboursCode    visitNeighbours
 //   sums over neighbours   sumNeighbours        sumNeighboursCode     advance
-//   perception             perceive                                   advance, stateGradient
+//   perception             perceive, logScaled  sumNeighboursCode     advance
 //   network                applyLayer           applyLayerCode        advance
-//   new positions, states  update
+//   new positions, states  update                                     advance
 //
 // test_a_step_of_each_engine_is_that_of_python of tests/web/test_export_browser.py compares all three in random worlds.
-// Here particles are sorted by cell, densities are sums over pairs in float64, and only active particles perceive.
+// Here particles are sorted by cell, and only active particles perceive.
 
 export const MOMENT_THRESHOLD = 1e-3;
 export const SQUARED_MOMENT_SOFTENING = 1e-2 ** 2;
-
-// The upper triangle of the unit matrix: xx, xy, xz, yy, yz, zz.
-const IDENTITY = [1, 0, 0, 1, 0, 1];
 
 // Perception vectors to which the network is applied at a time.
 const BLOCK_ROWS = 64;
@@ -34,14 +31,30 @@ export function padded(channels) {
   return LANES * Math.ceil(channels / LANES);
 }
 
+export function numbersBelow(count) {
+  return [...new Array(count).keys()];
+}
+
 // A rule ready to run: hyper-parameters by NPARule's names, weights by those of its file.
 export function prepareRule(description, kernels) {
   const rule = { ...description };
   const { weights, hidden_dim: hidden, state_dim: channels, space_dim: dimension } = rule;
-  // The length P of the perception vector, as NPARule.perception_dim.
-  rule.inputs = 2 * channels + (rule.state_gradient ? channels * dimension : 0) + (rule.density_gradient ? dimension : 0);
+  // Perception vectors are rows of padded parts: the state, the smoothed state, its slopes along each axis; then the
+  // density's slopes and, as the last number, 1. `columns` are their places in the order of NPARule's perception.
+  const width = padded(channels), matrix = weights["hidden.weight"];
+  rule.inputs = (2 + dimension) * width + LANES;
+  const columns = [0, 1].flatMap((part) => numbersBelow(channels).map((c) => part * width + c));
+  const slopeAt = (p) => (2 + p % dimension) * width + Math.floor(p / dimension);
+  if (rule.state_gradient) columns.push(...numbersBelow(channels * dimension).map(slopeAt));
+  if (rule.density_gradient) columns.push(...numbersBelow(dimension).map((d) => rule.inputs - LANES + d));
+  // W with these columns, and b as the last one: [hidden, inputs].
+  rule.matrix = new Float32Array(hidden * rule.inputs);
+  for (let h = 0; h < hidden; h++) {
+    columns.forEach((column, p) => (rule.matrix[h * rule.inputs + column] = matrix[h * columns.length + p]));
+    rule.matrix[(h + 1) * rule.inputs - 1] = weights["hidden.bias"][h];
+  }
   rule.outputs = channels + (rule.static ? 0 : rule.space_dim);
-  rule.hidden = kernels.makeLayer(weights["hidden.weight"], weights["hidden.bias"], rule.inputs, hidden);
+  rule.hidden = kernels.makeLayer(rule.matrix, null, rule.inputs, hidden);
   rule.output = kernels.makeLayer(weights["output.weight"], null, hidden, rule.outputs);
   return rule;
 }
@@ -51,14 +64,51 @@ export function plainKernels() {
   const floats = (length) => new Float32Array(length);
   return {
     name: "JavaScript", floats, integers: (length) => new Int32Array(length),
-    sumNeighbours, listNeighbours, makeLayer: (...matrix) => tiledLayer(floats, ...matrix), applyLayer,
+    sumDensities, listNeighbours, sumNeighbours,
+    makeLayer: (...matrix) => tiledLayer(floats, ...matrix), applyLayer,
   };
 }
 
-// Sums over the neighbours of sorted particle i, which `listNeighbours` has listed, into `sums` [1 + D, width]
-// of a Physics: Σ smoothing s_j, and Σ slope (s_j - s_i) for each axis.
-function sumNeighbours(physics, i) {
-  const { states, width, sums, dimension, list } = physics;
+// Adds to the densities and their gradients what pairs of sorted particles add, of which one is in [first, end) and
+// the other one, behind it, in the `ranges` of a Physics.
+function sumDensities(physics, first, end) {
+  const { density, gradient: [gradientX, gradientY, gradientZ], ranges, rangesEnd, eps, weight, slope } = physics;
+  const { x: px, y: py, z: pz } = physics.points;
+  const [sideX, sideY, sideZ] = physics.sides;
+  const [halfX, halfY, halfZ] = physics.halfSides;
+  const squaredRadius = eps * eps;
+  for (let i = first; i < end; i++) {
+    const x = px[i], y = py[i], z = pz[i];
+    let sum = 0, sumX = 0, sumY = 0, sumZ = 0;
+    for (let r = 0; r < rangesEnd; r += 2) {
+      const last = ranges[r + 1];
+      // Each pair once: i and j add the same to each other, the gradient with opposite sign.
+      for (let j = Math.max(ranges[r], i + 1); j < last; j++) {
+        const dx = toNearest(px[j] - x, sideX, halfX);
+        const dy = toNearest(py[j] - y, sideY, halfY);
+        const dz = toNearest(pz[j] - z, sideZ, halfZ);
+        const squared = dx * dx + dy * dy + dz * dz;
+        if (!(squared < squaredRadius)) continue;
+        const left = squaredRadius - squared;
+        const w = weight * left * left * left;
+        sum += w;
+        density[j] += w;
+        if (squared === 0) continue;
+        const distance = Math.sqrt(squared);
+        const k = (slope * (eps - distance) * (eps - distance)) / distance;
+        sumX += k * dx; sumY += k * dy; sumZ += k * dz;
+        gradientX[j] -= k * dx; gradientY[j] -= k * dy; gradientZ[j] -= k * dz;
+      }
+    }
+    density[i] += sum;
+    gradientX[i] += sumX; gradientY[i] += sumY; gradientZ[i] += sumZ;
+  }
+}
+
+// Writes the state of sorted particle i, and sums over its neighbours, which `listNeighbours` has listed, into `rows`
+// of a Physics at `at`: s_i, Σ smoothing s_j, and L(inverse Σ slope (s_j - s_i)) for each axis.
+function sumNeighbours(physics, i, at) {
+  const { states, width, rows, dimension, list, inverse: m } = physics;
   const { count, stateAt, smoothing, slopes: [slopeX, slopeY, slopeZ] } = list;
   for (let c = 0; c < width; c++) {
     const mine = states[i * width + c];
@@ -70,10 +120,12 @@ function sumNeighbours(physics, i) {
       y += slopeY[n] * offset;
       if (dimension === 3) z += slopeZ[n] * offset;
     }
-    sums[c] = smoothed;
-    sums[width + c] = x;
-    sums[2 * width + c] = y;
-    if (dimension === 3) sums[3 * width + c] = z;
+    rows[at + c] = mine;
+    rows[at + width + c] = smoothed;
+    logScaled(
+      rows, at + 2 * width + c, width, dimension,
+      x * m[0] + y * m[1] + z * m[2], x * m[1] + y * m[3] + z * m[4], x * m[2] + y * m[4] + z * m[5],
+    );
   }
 }
 
@@ -119,7 +171,7 @@ function applyLayer({ inputs, width, weights, offset }, count, rows, rowWidth, o
       const from = row * rowWidth;
       let s0 = offset[tile], s1 = offset[tile + 1], s2 = offset[tile + 2], s3 = offset[tile + 3];
       let s4 = offset[tile + 4], s5 = offset[tile + 5], s6 = offset[tile + 6], s7 = offset[tile + 7];
-      for (let p = 0, at = tile * inputs; p < inputs; p++, at += TILE_OUTPUTS) {
+      for (let p = 0, at = tile * padded(inputs); p < inputs; p++, at += TILE_OUTPUTS) {
         const value = rows[from + p];
         s0 += value * weights[at]; s1 += value * weights[at + 1];
         s2 += value * weights[at + 2]; s3 += value * weights[at + 3];
@@ -137,13 +189,13 @@ function applyLayer({ inputs, width, weights, offset }, count, rows, rowWidth, o
 }
 
 // A layer of a matrix [outputs, inputs], row by row, and a bias or null, as `applyLayer` reads it: eight outputs at
-// a time are contiguous, [tiles, inputs, 8].
+// a time are contiguous, [tiles, inputs, 8], with inputs padded by zeros.
 export function tiledLayer(floats, weight, bias, inputs, outputs) {
   const width = TILE_OUTPUTS * Math.ceil(outputs / TILE_OUTPUTS);
-  const weights = floats(width * inputs), offset = floats(width);
+  const weights = floats(width * padded(inputs)), offset = floats(width);
   if (bias !== null) offset.set(bias);
   for (let a = 0; a < outputs; a++) {
-    const tile = Math.floor(a / TILE_OUTPUTS) * inputs;
+    const tile = Math.floor(a / TILE_OUTPUTS) * padded(inputs);
     for (let p = 0; p < inputs; p++) {
       weights[(tile + p) * TILE_OUTPUTS + (a % TILE_OUTPUTS)] = weight[a * inputs + p];
     }
@@ -162,13 +214,14 @@ export class Physics {
     this.width = padded(this.channels);
     this.capacity = capacity;
 
-    const doubles = () => new Float64Array(capacity);
     // Kernels look at four particles at a time, and write four.
     const room = capacity + LANES;
     const floats = () => kernels.floats(room);
+    // What kernels read of a step: eps, eps², weight, slope, sides (3), inverse sides (3).
+    this.constants = kernels.floats(10);
     this.points = { x: floats(), y: floats(), z: floats(), volume: floats() };
-    this.density = doubles();
-    [this.gradientX, this.gradientY, this.gradientZ] = [doubles(), doubles(), doubles()];
+    this.density = floats();
+    this.gradient = [floats(), floats(), floats()];
     this.order = new Int32Array(capacity);
     this.cellOf = new Int32Array(capacity);
     this.starts = new Int32Array(1);
@@ -182,9 +235,10 @@ export class Physics {
       slopes: [floats(), floats(), floats()],
       moment: new Float64Array(6),
     };
-    this.sums = kernels.floats((1 + this.dimension) * this.width);
+    // The inverse of a moment matrix times the scale of slopes: xx, xy, xz, yy, yz, zz.
+    this.inverse = kernels.floats(6);
     const widest = (width) => kernels.floats(BLOCK_ROWS * Math.max(...rules.map(width)));
-    this.rowWidth = Math.max(...rules.map((rule) => rule.inputs));
+    this.rowWidth = rules[0].inputs;
     this.rows = widest(() => this.rowWidth);
     this.hidden = widest((rule) => rule.hidden.width);
     this.updates = widest((rule) => rule.output.width);
@@ -199,11 +253,53 @@ export class Physics {
   // eps: perception radius [length units]; box: sides, or null; mask: Uint8Array, 1 where a particle
   // is updated, or null for all; noise: offsets of positions, or null; densityCounts: numbers by which
   // each rule's densities are divided, by default the particles of the world.
-  step(world, { eps, box = null, mask = null, noise = null, densityCounts = null }) {
+  step(world, { eps, box = null, noise = null, ...options }) {
     this.sort(world, eps, box);
-    this.computeDensities(world.count);
-    this.rules.forEach((_, number) => this.advance(world, number, densityCounts?.[number] ?? world.count, mask));
+    this.advancePart(world, options, 0, 1);
     this.finish(world, noise, box);
+  }
+
+  // Advances the particles of one of several parts of a sorted world, without noise: the other ones stay as they are.
+  advancePart(world, { mask = null, densityCounts = null }, part, parts) {
+    const [first, end] = this.cellsOf(world.count, part, parts);
+    const total = this.cellCount, reach = 3 * (total / this.cells[this.dimension - 1]);
+    const some = end - first + 2 * reach < total;
+    this.computeDensities(world.count, some ? first - reach + total : 0, some ? end - first + 2 * reach : total);
+    for (let number = 0; number < this.rules.length; number++) {
+      this.advance(world, number, densityCounts?.[number] ?? world.count, mask, first, end);
+    }
+  }
+
+  // The first cell of a part, and the one after its last: parts have about as many particles.
+  cellsOf(count, part, parts) {
+    return [part, part + 1].map((number) => {
+      let low = 0, high = this.cellCount;
+      while (low < high) {
+        const middle = (low + high) >> 1;
+        if (this.starts[middle] * parts < count * number) low = middle + 1;
+        else high = middle;
+      }
+      return low;
+    });
+  }
+
+  // Returns x and s of the particles of a part, one after the other; or writes those that are given to the world.
+  exchange({ count, x, s }, part, parts, given = null) {
+    const { dimension, channels, order } = this;
+    const [from, to] = this.cellsOf(count, part, parts).map((cell) => this.starts[cell]);
+    const values = given ?? new Float32Array((to - from) * (dimension + channels));
+    let at = 0;
+    const copy = (array, first, end) => {
+      for (let k = first; k < end; k++, at++) {
+        if (given === null) values[at] = array[k];
+        else array[k] = values[at];
+      }
+    };
+    for (let k = from; k < to; k++) {
+      copy(x, order[k] * dimension, (order[k] + 1) * dimension);
+      copy(s, order[k] * channels, (order[k] + 1) * channels);
+    }
+    return values;
   }
 
   // Adds noise and moves particles back into the box.
@@ -218,7 +314,10 @@ export class Physics {
   sort({ count, x, s }, eps, box) {
     const inverse = this.setGrid(x, count, eps, box);
     this.orderByCell(x, count, inverse);
-    const { dimension, channels, width, order, states, points } = this;
+    const { dimension, channels, width, order, points } = this;
+    // Integers of the same bits are copied without conversions.
+    const bitsOf = ({ buffer, byteOffset, length }) => new Int32Array(buffer, byteOffset, length);
+    const to = bitsOf(this.states), from = bitsOf(s);
     const [sideX, sideY, sideZ] = this.sides;
     const inBox = (position, side) => (side > 0 ? position - side * Math.floor(position / side + 0.5) : position);
     for (let k = 0; k < count; k++) {
@@ -226,7 +325,7 @@ export class Physics {
       points.x[k] = inBox(x[i * dimension], sideX);
       points.y[k] = inBox(x[i * dimension + 1], sideY);
       points.z[k] = dimension === 3 ? inBox(x[i * dimension + 2], sideZ) : 0;
-      for (let c = 0; c < channels; c++) states[k * width + c] = s[i * channels + c];
+      for (let c = 0; c < channels; c++) to[k * width + c] = from[i * channels + c];
     }
   }
 
@@ -260,21 +359,26 @@ export class Physics {
       }
     }
     this.halfSides = this.perSide.map((per) => 0.5 / per);
+    this.constants.set([eps, eps * eps, this.weight, this.slope, ...this.sides, ...this.perSide]);
     this.cells = cells;
+    this.cellCount = cells[0] * cells[1] * cells[2];
     return inverse;
   }
 
   // Writes particles' indices, sorted by cell, to `order`, and where each cell's particles begin to `starts`.
   orderByCell(x, count, inverse) {
-    const { dimension, order, cellOf, cells } = this;
+    const { dimension, order, cellOf, cells, cellCount: total } = this;
     const three = dimension === 3;
-    const [nx, ny, nz] = cells;
-    const total = nx * ny * nz;
+    const [nx, ny] = cells;
     if (this.starts.length < total + 1) this.starts = new Int32Array(total + 1);
     const starts = this.starts.fill(0, 0, total + 1);
     const cellAlong = (position, d) => {
-      const cell = Math.floor(position * inverse[d]) % cells[d];
-      return cell < 0 ? cell + cells[d] : cell | 0;
+      const along = cells[d];
+      let cell = Math.floor(position * inverse[d]);
+      if (cell < 0) cell += along;
+      // Remainders are slow, and needed by far particles only.
+      if (!(cell >= 0 && cell < along)) cell = ((cell % along) + along) % along;
+      return cell | 0;
     };
     for (let i = 0; i < count; i++) {
       const at = i * dimension;
@@ -320,56 +424,25 @@ export class Physics {
     this.rangesEnd = used;
   }
 
-  computeDensities(count) {
-    const { x: px, y: py, z: pz, volume } = this.points;
-    const { density, gradientX, gradientY, gradientZ, ranges, starts, eps, weight, slope } = this;
-    const [sideX, sideY, sideZ] = this.sides;
-    const [halfX, halfY, halfZ] = this.halfSides;
-    const squaredRadius = eps * eps;
-    for (const gradient of [gradientX, gradientY, gradientZ]) gradient.fill(0, 0, count);
+  // Computes the densities in some cells, in all by default: `cells` from `first` on, after the last one the first one.
+  computeDensities(count, first = 0, cells = this.cellCount) {
+    const { density, gradient, starts, points: { volume } } = this;
+    for (const axis of gradient) axis.fill(0, 0, count);
     // The particle itself.
-    density.fill(weight * squaredRadius ** 3, 0, count);
-    const total = this.cells[0] * this.cells[1] * this.cells[2];
-    for (let cell = 0; cell < total; cell++) {
-      const end = starts[cell + 1];
-      if (starts[cell] === end) continue;
+    density.fill(this.weight * this.eps ** 6, 0, count);
+    for (let n = 0; n < cells; n++) {
+      const cell = (first + n) % this.cellCount;
+      if (starts[cell] === starts[cell + 1]) continue;
       this.rangesAround(cell);
-      const { rangesEnd } = this;
-      for (let i = starts[cell]; i < end; i++) {
-        const x = px[i], y = py[i], z = pz[i];
-        let sum = 0, sumX = 0, sumY = 0, sumZ = 0;
-        for (let r = 0; r < rangesEnd; r += 2) {
-          const last = ranges[r + 1];
-          // Each pair once: i and j add the same to each other, the gradient with opposite sign.
-          for (let j = Math.max(ranges[r], i + 1); j < last; j++) {
-            const dx = toNearest(px[j] - x, sideX, halfX);
-            const dy = toNearest(py[j] - y, sideY, halfY);
-            const dz = toNearest(pz[j] - z, sideZ, halfZ);
-            const squared = dx * dx + dy * dy + dz * dz;
-            if (!(squared < squaredRadius)) continue;
-            const left = squaredRadius - squared;
-            const w = weight * left * left * left;
-            sum += w;
-            density[j] += w;
-            if (squared === 0) continue;
-            const distance = Math.sqrt(squared);
-            const k = (slope * (eps - distance) * (eps - distance)) / distance;
-            sumX += k * dx; sumY += k * dy; sumZ += k * dz;
-            gradientX[j] -= k * dx; gradientY[j] -= k * dy; gradientZ[j] -= k * dz;
-          }
-        }
-        density[i] += sum;
-        gradientX[i] += sumX; gradientY[i] += sumY; gradientZ[i] += sumZ;
-      }
+      this.kernels.sumDensities(this, starts[cell], starts[cell + 1]);
     }
     for (let i = 0; i < count; i++) volume[i] = 1 / density[i];
   }
 
-  // Perceives the active particles of one rule, runs its network, and updates them.
-  advance(world, number, densityCount, mask) {
+  // Perceives the active particles of one rule in the cells [first, end), runs its network, and updates them.
+  advance(world, number, densityCount, mask, first, end) {
     const { order, starts, blockRows, kernels, rows, rowWidth, hidden, updates } = this;
     const rule = this.rules[number];
-    const total = this.cells[0] * this.cells[1] * this.cells[2];
     let filled = 0;
     const flush = () => {
       if (filled === 0) return;
@@ -380,7 +453,7 @@ export class Physics {
       }
       filled = 0;
     };
-    for (let cell = 0; cell < total; cell++) {
+    for (let cell = first; cell < end; cell++) {
       let found = false;
       for (let i = starts[cell]; i < starts[cell + 1]; i++) {
         const particle = order[i];
@@ -397,33 +470,14 @@ export class Physics {
 
   // Writes the perception vector of sorted particle i into `rows` at `at`.
   perceive(rule, i, at, densityCount) {
-    const { width, dimension, channels, rows, sums, states, kernels } = this;
+    const { width, dimension, rows, kernels, inverse, gradient: [x, y, z] } = this;
     kernels.listNeighbours(this, i);
-    kernels.sumNeighbours(this, i);
-
-    let to = at;
-    for (let c = 0; c < channels; c++) rows[to++] = states[i * width + c];
-    for (let c = 0; c < channels; c++) rows[to++] = sums[c];
     const scale = this.eps / rule.eps0;
-    if (rule.state_gradient) {
-      const m = rule.moment_correction ? momentInverse(dimension, this.list.moment, rule.moment_inverse) : IDENTITY;
-      for (let c = 0; c < channels; c++) {
-        const gx = sums[width + c], gy = sums[2 * width + c], gz = dimension === 3 ? sums[3 * width + c] : 0;
-        to = logScaled(
-          rows, to, dimension,
-          scale * (gx * m[0] + gy * m[1] + gz * m[2]),
-          scale * (gx * m[1] + gy * m[3] + gz * m[4]),
-          scale * (gx * m[2] + gy * m[4] + gz * m[5]),
-        );
-      }
-    }
-    const densityScale = scale ** (1 + dimension) / densityCount;
-    if (rule.density_gradient) {
-      to = logScaled(
-        rows, to, dimension,
-        densityScale * this.gradientX[i], densityScale * this.gradientY[i], densityScale * this.gradientZ[i],
-      );
-    }
+    invertMoment(rule, this.list.moment, scale, inverse);
+    kernels.sumNeighbours(this, i, at);
+    const end = at + rule.inputs, densityScale = scale ** (1 + dimension) / densityCount;
+    logScaled(rows, end - LANES, 1, dimension, densityScale * x[i], densityScale * y[i], densityScale * z[i]);
+    rows[end - 1] = 1;
   }
 
   // x ← x + α ε δ / (1 + |δ|), s ← s + Δs for one particle, whose δ and Δs begin at `from`; numbers
@@ -460,32 +514,35 @@ export function wrap(x, count, box) {
   }
 }
 
-// Writes L(v) = log(1 + |v|) v / |v| and returns the next index.
-function logScaled(rows, at, dimension, x, y, z) {
+// Writes L(v) = log(1 + |v|) v / |v|, its components `stride` apart.
+function logScaled(rows, at, stride, dimension, x, y, z) {
   if (dimension === 2) z = 0;
   const length = Math.sqrt(x * x + y * y + z * z);
   const factor = length > 0 ? Math.log1p(length) / length : 1;
   rows[at] = factor * x;
-  rows[at + 1] = factor * y;
-  if (dimension === 2) return at + 2;
-  rows[at + 2] = factor * z;
-  return at + 3;
+  rows[at + stride] = factor * y;
+  if (dimension === 3) rows[at + 2 * stride] = factor * z;
 }
 
-// The upper triangle (xx, xy, xz, yy, yz, zz) of the inverse of M, or of its replacement.
-function momentInverse(dimension, [xx, xy, xz, yy, yz, zz], inverse) {
-  let determinant, adjugate;
-  if (dimension === 2) {
-    determinant = xx * yy - xy * xy;
-    adjugate = [yy, -xy, 0, xx, 0, 0];
-  } else {
-    adjugate = [yy * zz - yz * yz, xz * yz - xy * zz, xy * yz - xz * yy, xx * zz - xz * xz, xy * xz - xx * yz, xx * yy - xy * xy];
-    determinant = xx * adjugate[0] + xy * adjugate[1] + xz * adjugate[2];
+// Writes `scale` times the upper triangle of the inverse of M, or of its replacement, to `out`.
+function invertMoment({ space_dim: dimension, moment_correction: corrects, moment_inverse: kind }, moment, scale, out) {
+  const xx = moment[0], xy = moment[1], xz = moment[2], yy = moment[3], yz = moment[4], zz = moment[5];
+  // The adjugate.
+  let a = yy, b = -xy, c = 0, d = xx, e = 0, f = 0;
+  if (dimension === 3) {
+    a = yy * zz - yz * yz; b = xz * yz - xy * zz; c = xy * yz - xz * yy;
+    d = xx * zz - xz * xz; e = xy * xz - xx * yz; f = xx * yy - xy * xy;
   }
-  if (inverse === "smooth") {
+  const determinant = xx * a + xy * b + xz * c;
+  let factor = 0, unit = scale;
+  if (corrects && kind === "smooth") {
     const divisor = determinant * determinant + SQUARED_MOMENT_SOFTENING;
-    return adjugate.map((entry, k) => (determinant * entry + SQUARED_MOMENT_SOFTENING * IDENTITY[k]) / divisor);
+    factor = (scale * determinant) / divisor;
+    unit = (scale * SQUARED_MOMENT_SOFTENING) / divisor;
+  } else if (corrects && Math.abs(determinant) >= MOMENT_THRESHOLD) {
+    factor = scale / determinant;
+    unit = 0;
   }
-  if (!(Math.abs(determinant) >= MOMENT_THRESHOLD)) return IDENTITY;
-  return adjugate.map((entry) => entry / determinant);
+  out[0] = factor * a + unit; out[1] = factor * b; out[2] = factor * c;
+  out[3] = factor * d + unit; out[4] = factor * e; out[5] = factor * f + unit;
 }

@@ -4,14 +4,16 @@
 import { clump, cut, cutAlong, wipeState, inject, insideBall, push, scatter, stateAround } from "./brushes.js";
 import { Colouring, RuleColours } from "./colours.js";
 import { fastestKernels } from "./kernels_simd.js";
-import { padded, Physics, prepareRule, wrap } from "./physics.js";
+import { numbersBelow, padded, Physics, prepareRule, wrap } from "./physics.js";
 import { GpuPhysics, openDevice } from "./physics_gpu.js";
 
 // Maximum number of frames that the page has not drawn yet: the world waits for a slow or hidden page.
 const FRAMES_AHEAD = 2;
 
-// The number of steps in which the GPU is compared with the CPU, and the largest difference of right results.
+// The number of steps in which the GPU is compared with the CPU, how many times as fast it needs no more of them, and the
+// largest difference of right results.
 const TRIAL_STEPS = 4;
+const CLEARLY_FASTER = 4;
 const TRIAL_TOLERANCE = 1e-3;
 
 // What brushes do, by the names of `BRUSHES` of npa_envs/web/messages.py: functions of a RuleWorld and a message
@@ -65,10 +67,33 @@ const DAMAGES = {
   noise: ({ world: { x }, random }, size) => random.normals(x.length, size).forEach((offset, k) => (x[k] += offset)),
 };
 
+// Helpers are workers that advance parts of a world of at least so many particles: half of the processor's threads,
+// less this worker, at most so many.
+const MIN_SHARED = 2048;
+const MAX_HELPERS = 3;
+
+// Starts helpers that run `code`; none without it, or where the browser does not let a worker start others.
+function startHelpers(code) {
+  if (!code) return [];
+  try {
+    const address = URL.createObjectURL(new Blob([code], { type: "text/javascript" }));
+    const count = Math.min(MAX_HELPERS, (navigator.hardwareConcurrency >> 1) - 1);
+    return numbersBelow(Math.max(0, count)).map(() => new Worker(address));
+  } catch {
+    return [];
+  }
+}
+
+// Physics of rules with weights prepared, by the fastest kernels.
+function makePhysics(rules, capacity, periodic) {
+  const kernels = fastestKernels(padded(rules[0].state_dim), rules[0].space_dim, periodic);
+  return new Physics(rules.map((rule) => prepareRule(rule, kernels)), capacity, kernels);
+}
+
 export class RuleWorld {
   // settings: {rules, seed, colours, constants} as npa_envs/web/export.py writes them; the first rule is shown
   // first. send(event, transferred) sends an event to the page; device: a GPU, or null.
-  // settings.engine: "auto" uses the GPU if it is faster, "gpu" always.
+  // settings.engine: "auto" uses the GPU if it is faster, "gpu" always. settings.code: what helpers run, if any may.
   constructor(settings, send, device = null) {
     this.device = device;
     this.engine = settings.engine ?? "auto";
@@ -76,6 +101,7 @@ export class RuleWorld {
     this.colourTables = mapped(settings.colours, bytesOf);
     this.constants = settings.constants;
     this.send = send;
+    this.helpers = startHelpers(settings.code);
     this.playing = true;
     this.changed = false;
     this.undrawn = 0;
@@ -132,8 +158,9 @@ export class RuleWorld {
 
   // Allocates memory for the present particles, and prepares the weights of the present species.
   prepare() {
-    const kernels = (this.kernels = fastestKernels(padded(this.channels), this.dimension));
-    this.physics = new Physics(this.species.map((rule) => prepareRule(rule, kernels)), this.world.count, kernels);
+    this.physics = makePhysics(this.species, this.world.count, this.box !== null);
+    const kernels = (this.kernels = this.physics.kernels);
+    this.helpersKnow = false;
     this.ruleColours = this.species.map((rule) => new RuleColours(rule, kernels, this.constants.COLOUR_OFFSET));
     this.gpu?.close();
     this.gpu = null;
@@ -144,23 +171,50 @@ export class RuleWorld {
   // Makes a step of the physics, on the GPU if it is faster and its results are right.
   async compute(options) {
     const { world, physics, trial } = this;
-    if (this.device === null) return physics.step(world, options);
+    if (this.device === null) return this.share(options);
     try {
       this.gpu ??= await GpuPhysics.make(this.device, physics);
       if (trial.left === 0) return await this.gpu.step(world, options);
     } catch {
       this.leaveGpu();
-      return physics.step(world, options);
+      return this.share(options);
     }
     const other = { ...world, x: world.x.slice(), s: world.s.slice() };
     const started = performance.now();
-    physics.step(world, options);
+    await this.share(options);
     const between = performance.now();
     const agrees = await this.gpu.step(other, options).then(() => alike(world, other), () => false);
     trial.cpu = Math.min(trial.cpu, between - started);
     trial.gpu = Math.min(trial.gpu, performance.now() - between);
-    trial.left--;
+    trial.left = trial.cpu > CLEARLY_FASTER * trial.gpu ? 0 : trial.left - 1;
     if (!agrees || (trial.left === 0 && trial.gpu > trial.cpu)) this.leaveGpu();
+  }
+
+  // Makes a step on the processor. Pages from a disk may not share memory: helpers get a copy of the world, and return
+  // the particles of their parts.
+  async share({ eps, box, noise, ...options }) {
+    const { world, physics, helpers } = this;
+    const parts = 1 + (this.kernels.name === "WebAssembly" && world.count >= MIN_SHARED ? helpers.length : 0);
+    const begin = this.helpersKnow ? null : { rules: this.species, capacity: physics.capacity };
+    const replies = helpers.slice(0, parts - 1).map((helper, k) => new Promise((resolve) => {
+      helper.onmessage = ({ data }) => resolve(data);
+      helper.onerror = (event) => {
+        event.preventDefault();
+        resolve(null);
+      };
+      helper.postMessage({ type: "share", begin, world, options: { ...options, eps, box }, part: k + 1, parts });
+    }));
+    if (parts > 1) this.helpersKnow = true;
+    physics.sort(world, eps, box);
+    physics.advancePart(world, options, 0, parts);
+    for (const [k, values] of (await Promise.all(replies)).entries()) {
+      if (values !== null) physics.exchange(world, k + 1, parts, values);
+      else {
+        physics.advancePart(world, options, k + 1, parts);
+        this.helpers = [];
+      }
+    }
+    physics.finish(world, noise, box);
   }
 
   leaveGpu() {
@@ -358,7 +412,7 @@ function bytesOf(text) {
 export function serve(scope) {
   const send = (event, transferred = []) => scope.postMessage(event, transferred);
   const messages = [], clock = new MessageChannel();
-  let live = null, busy = false;
+  let live = null, busy = false, physics = null;
 
   const apply = async ({ type, settings, ...rest }) => {
     if (type !== "begin") return live.receive({ type, ...rest });
@@ -384,7 +438,15 @@ export function serve(scope) {
   };
 
   clock.port1.onmessage = handleNext;
+  const share = ({ begin, world, options, part, parts }) => {
+    if (begin !== null) physics = makePhysics(begin.rules, begin.capacity, options.box !== null);
+    physics.sort(world, options.eps, options.box);
+    physics.advancePart(world, options, part, parts);
+    return physics.exchange(world, part, parts);
+  };
+
   scope.onmessage = ({ data }) => {
+    if (data.type === "share") return send(share(data));
     messages.push(data);
     handleNext();
   };

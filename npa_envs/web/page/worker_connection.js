@@ -31,7 +31,7 @@ async function connect(settings, listener) {
   };
   // "?engine=processor" in the address avoids the GPU, "?engine=gpu" always uses it.
   const engine = new URLSearchParams(location.search).get("engine") ?? "auto";
-  worker.postMessage({ type: "begin", settings: { ...settings, engine } });
+  worker.postMessage({ type: "begin", settings: { ...settings, engine, code: text } });
   return {
     send(message) {
       worker.postMessage(message);
