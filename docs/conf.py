@@ -79,6 +79,8 @@ html_static_path = ["static"]
 html_css_files = ["site.css"]
 html_extra_path = ["static/index.html"]
 html_show_sphinx = False
+# Opened from a disk, a page cannot fetch others to quote them.
+html_show_search_summary = False
 if (address := repository_address()) is not None:
     html_baseurl = names_of(address)["site"]
     html_theme_options = {

@@ -202,7 +202,8 @@ def shortfalls(tables: Mapping[str, Sequence[Any]]) -> list[str]:
         clauses.append(f"unlike the target: {rows[-1].psnr:.1f} dB at step {rows[-1].step}")
     for row in tables.get("healing", ()):
         if isinstance(row, WoundRow):
-            healed, count, what = row.healed, row.changed, f"places keep a scar ({row.scars})"
+            healed, count = row.healed, row.changed
+            what = f"places that it changed keep a scar ({row.scars})"
         else:
             healed, count, what = row.worlds_healed, row.world_count, "worlds do not heal"
         if healed < count:

@@ -56,6 +56,11 @@ class PerceptionFields(NamedTuple):
     drho: Tensor
     """Density gradients [1 / length^(D+1)], shape [B, N, D]."""
 
+    def __repr__(self) -> str:
+        """Return the names and shapes of the fields."""
+        shapes = (f"{name}={list(field.shape)}" for name, field in self._asdict().items())
+        return f"PerceptionFields({', '.join(shapes)})"
+
 
 def perceive(
     x: Tensor,
