@@ -203,7 +203,7 @@ def shortfalls(tables: Mapping[str, Sequence[Any]]) -> list[str]:
     for row in tables.get("healing", ()):
         if isinstance(row, WoundRow):
             healed, count = row.healed, row.changed
-            what = f"places that it changed keep a scar ({row.scars})"
+            what = f"changed places keep a scar ({row.scars})"
         else:
             healed, count, what = row.worlds_healed, row.world_count, "worlds do not heal"
         if healed < count:

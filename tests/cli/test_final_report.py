@@ -145,8 +145,8 @@ def test_a_card_says_in_words_what_does_not_hold():
     wound = WoundRow("wipe, radius 0.2", 6, 5, 3, 0.1, 1.0, 0.3, scars="top left, bottom")
     whole = HealingRow("cut, gap 0.1", 0.1, 0.5, None, 6, 8, 0.2)
     assert report.shortfalls({"growth": growth, "healing": [wound, whole]}) == [
-        "after a wipe, radius 0.2, 2 of 5 places keep a scar (top left, bottom); the mean loss "
-        "becomes 3.0 times that before",
+        "after a wipe, radius 0.2, 2 of 5 changed places keep a scar (top left, bottom); the mean "
+        "loss becomes 3.0 times that before",
         "after a cut, gap 0.1, 2 of 8 worlds do not heal; the mean loss becomes 2.0 times that "
         "before",
     ]
