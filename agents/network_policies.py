@@ -97,6 +97,11 @@ def load_policy(source: str, env: Any) -> Callable[[Any], Any]:
         NPAError: There is no such policy, its file is damaged, or it does not fit `env`.
     """
     worlds, task = unwrapped(env).worlds, unwrapped(env).task
+    if source == "shipped":
+        shipped, id = shipped_policies(), getattr(env.spec, "id", None)
+        if id not in shipped:
+            raise NPAError(f"no policy is shipped for {shown(id)}: {suggest(id, shipped)}")
+        source = str(shipped[id])
     if task.controls not in ("brushes", "codes") and task.config.control != "central":
         if source in ("zero", "random"):
             return (ZeroPolicy if source == "zero" else RandomPolicy)(env)
@@ -106,11 +111,6 @@ def load_policy(source: str, env: Any) -> Callable[[Any], Any]:
         return _actions_of(acted, random=source == "random")
     if source == "scripted":
         return (ScriptedShepherd if isinstance(task, ShepherdTask) else ScriptedGardener)(env)
-    if source == "shipped":
-        shipped, id = shipped_policies(), getattr(env.spec, "id", None)
-        if id not in shipped:
-            raise NPAError(f"no policy is shipped for {shown(id)}: {suggest(id, shipped)}")
-        source = str(shipped[id])
     policy = NetworkPolicy.load(source, worlds.device)
     seen = getattr(env, "single_observation_space", None) or env.observation_space
     ends: Any = policy.network[0].in_features, policy.network[-1].out_features

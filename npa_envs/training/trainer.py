@@ -206,7 +206,7 @@ class Trainer:
             self._update_log()
             interval = config.picture_interval
             early, last = self.iteration == FIRST_PICTURE, self.iteration == total
-            if self._due(interval) or (early and FIRST_PICTURE < interval) or (last and interval):
+            if self._due(interval) or (early and interval > FIRST_PICTURE) or (last and interval):
                 self._write_picture()
             if self._due(config.checkpoint_interval) and self.iteration < total:
                 self.save()
