@@ -24,7 +24,10 @@ from npa_envs.world.particles import Particles, combined
 from npa_envs.world.randomness import StreamId, WorldRandom
 from npa_envs.world.rollout import rollout_particles
 
-FIRST_RULES = {"gecko": "gecko-v0", "heart": "heart-first"}
+FIRST_RULES = {
+    "heart": "heart-first",
+    **{name: f"{name}-v0" for name in ("butterfly", "flower", "gecko", "letter-a", "octopus")},
+}
 """Default rules by target; other targets are grown by the shipped rule of their name. Newer shipped
 rules do not replace these, so that environments stay the same."""
 

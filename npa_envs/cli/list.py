@@ -128,7 +128,8 @@ def rules() -> Iterator[str]:
             values = {row["step"]: format(row[column], form) for row in scores(name)[table]}
             text = ", ".join(f"{values[step]} at {step}" for step in STEPS if step in values)
             yield f"    {name:<10} {load_rule(name).weight_count:>6} weights  {text}"
-    yield f"  presets and environments start from: {', '.join(preset_rules())}"
+    yield "  presets and environments start from:"
+    yield f"    {', '.join(preset_rules())}"
 
 
 PARTS = {"rules": rules, "targets": targets, "ids": ids, "presets": presets}

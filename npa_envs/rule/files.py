@@ -268,7 +268,7 @@ def _locate(source: str | Path) -> tuple[Path, str | None]:
     if os.path.isfile(os.path.join(run, "rule.safetensors")):
         raise NPAError(f"unknown rule {shown(text)}: did you mean the run {shown(run)}?")
     raise NPAError(
-        f"unknown rule {shown(text)}: {suggest(text, named)}; or give the path of a "
+        f"unknown rule {shown(text)}: {suggest(text, shipped_rules())}; or give the path of a "
         f"file that ends in {suffixes}, or a run's folder"
     )
 

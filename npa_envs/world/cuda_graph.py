@@ -310,11 +310,13 @@ def _own_workspaces() -> Iterator[None]:
     Torch allocates it once for each stream and thread. Graphs captured on one stream would share
     it, and write over each other's products when they are replayed on several streams at once.
     """
-    torch._C._cuda_clearCublasWorkspaces()
+    # Torch without CUDA does not have the function.
+    clear = getattr(torch._C, "_cuda_clearCublasWorkspaces", lambda: None)
+    clear()
     try:
         yield
     finally:
-        torch._C._cuda_clearCublasWorkspaces()
+        clear()
 
 
 def may_be_disturbed(attempts: int) -> bool:

@@ -564,7 +564,7 @@ def test_the_authors_collection_is_written_as_they_wrote_it(reference, tmp_path)
 
 @pytest.mark.parametrize("channels", [3, 16])
 def test_a_collection_gives_each_of_its_rules_back(tmp_path, channels):
-    rules = {"mine": NPARule(2, channels, 7, eps0=0.12, alpha=0.3), "gecko": load_rule("gecko")}
+    rules = {"mine": NPARule(2, channels, 7, eps0=0.12, alpha=0.3), "gecko": load_rule("gecko-v0")}
     path = tmp_path / "models.json"
     save_demo_json(rules, path, particle_counts={"mine": 1000})
     for name, rule in rules.items():

@@ -435,11 +435,11 @@ def test_the_command_writes_pages_and_collections(tmp_path, capsys):
     assert f"wrote {page}" in capsys.readouterr().out
     written = re.search(r'id="rules">(.*?)</script>', page.read_text(encoding="utf-8"))[1]
     assert [rule["name"] for rule in json.loads(written)["rules"]] == ["gecko", "run"]
-    assert main(["export-web", "gecko", "--out", str(collection), "--particle-count", "77"]) == 0
+    words = ["export-web", "gecko-v0", "--out", str(collection), "--particle-count", "77"]
+    assert main(words) == 0
     assert '"N0": 77' in collection.read_text(encoding="utf-8")
-    assert torch.equal(
-        load_rule(f"{collection}#gecko").output.weight, load_rule("gecko").output.weight
-    )
+    rules = [load_rule(source) for source in (f"{collection}#gecko-v0", "gecko-v0")]
+    assert torch.equal(rules[0].output.weight, rules[1].output.weight)
     (tmp_path / "unfinished").mkdir()
     capsys.readouterr()
     for words, error in (
