@@ -205,8 +205,8 @@ class Trainer:
             self.iterate()
             self._update_log()
             interval = config.picture_interval
-            early, last = self.iteration == FIRST_PICTURE, self.iteration == total
-            if self._due(interval) or (early and interval > FIRST_PICTURE) or (last and interval):
+            early, last = self.iteration == FIRST_PICTURE < interval, self.iteration == total
+            if self._due(interval) or early or (last and interval):
                 self._write_picture()
             if self._due(config.checkpoint_interval) and self.iteration < total:
                 self.save()

@@ -171,10 +171,10 @@ export class TrainingCard {
       textContent: label, href: addressOf(`training/${id}/${file}`), download: `${stem}${end}`,
     });
     const how = state === "done" ? `Learned in ${duration(seconds)}` : `Stopped at iteration ${iteration} of ${total}`;
-    const hint = preset === "best" ? " Cut it, wipe a part of it." : " Cuts close; wiped parts may stay grey.";
-    const told = state === "done" && this.showing === id ? hint : "";
+    const finished = preset === "best" ? " Cut it, wipe a part of it." : " Cuts close; wiped parts may stay grey.";
+    const hint = state === "done" && this.showing === id ? finished : "";
     return [
-      this.heading(name), ...this.target(), text(`${how}.${told}`), this.quality(),
+      this.heading(name), ...this.target(), text(`${how}.${hint}`), this.quality(),
       row(link("Save rule", "rule.safetensors", ".safetensors"), link("Save page", "page.html", ".html"),
         this.showing === id ? button("Back", () => this.leave()) : this.watch(),
         button("Another", () => this.change({ choosing: true }))),
