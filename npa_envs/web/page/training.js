@@ -105,6 +105,7 @@ export class TrainingCard {
     const again = [...card.querySelectorAll("button, a")].find((one) => one.textContent === focused.textContent);
     if (inside) again?.focus();
     card.className = shown;
+    document.page.dirty = true; // The card covers another part of the world.
     // On a phone the card lies above the bar.
     card.style.setProperty("--bar", `${document.getElementById("bar").offsetHeight}px`);
   }
@@ -172,11 +173,11 @@ export class TrainingCard {
     });
     const how = state === "done" ? `Learned in ${duration(seconds)}` : `Stopped at iteration ${iteration} of ${total}`;
     const finished = preset === "best" ? " Cut it, wipe a part of it." : " Cuts close; wiped parts may stay grey.";
-    const hint = state === "done" && this.showing === id ? finished : "";
+    const watched = this.showing === id, hint = state === "done" && watched ? finished : "";
     return [
-      this.heading(name), ...this.target(), text(`${how}.${hint}`), this.quality(),
+      this.heading(watched ? name : `Your ${name}`), ...this.target(), text(`${how}.${hint}`), watched ? this.quality() : "",
       row(link("Save rule", "rule.safetensors", ".safetensors"), link("Save page", "page.html", ".html"),
-        this.showing === id ? button("Back", () => this.leave()) : this.watch(),
+        watched ? button("Back", () => this.leave()) : this.watch(),
         button("Another", () => this.change({ choosing: true }))),
       make("p", { className: "path", textContent: `The run is in ${folder}` }),
     ];
