@@ -128,7 +128,7 @@ function tiles(scene, width, height) {
   const range = (size, side, middle) => {
     const half = (size * unit) / 2 + SOFT_REACH * scene.spot;
     const first = Math.round((middle - half) / side), last = Math.round((middle + half) / side);
-    return Array.from({ length: Math.min(last - first + 1, 8) }, (_, k) => (first + k) * side);
+    return Array.from({ length: Math.min(last - first + 1, 16) }, (_, k) => (first + k) * side);
   };
   const rows = range(height, box[1], camera.centre[1]);
   return range(width, box[0], camera.centre[0]).flatMap((x) => rows.map((y) => [x, y, 0]));

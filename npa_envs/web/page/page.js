@@ -149,7 +149,7 @@ class Page {
 
   showError(message) {
     $("loading").hidden = $("writing").hidden = true;
-    $("message").textContent = message;
+    $("message").textContent = message[0].toUpperCase() + message.slice(1);
     $("message").hidden = false;
     clearTimeout(this.messageTimer);
     this.messageTimer = setTimeout(() => ($("message").hidden = true), 9000);
@@ -260,7 +260,11 @@ class Brushes {
       page.camera.magnify(Math.exp(-event.deltaY * 0.0015));
       page.dirty = true;
     }, { passive: false });
-    new ResizeObserver(() => (page.dirty = true)).observe(canvas);
+    const sizes = new ResizeObserver(() => {
+      document.documentElement.style.setProperty("--bar", `${$("bar").offsetHeight}px`);
+      page.dirty = true;
+    });
+    [canvas, $("bar")].forEach((one) => sizes.observe(one));
   }
 
   // The world's brushes that can do something in it: a graft takes a second rule.

@@ -106,8 +106,6 @@ export class TrainingCard {
     if (inside) again?.focus();
     card.className = shown;
     document.page.dirty = true; // The card covers another part of the world.
-    // On a phone the card lies above the bar.
-    card.style.setProperty("--bar", `${document.getElementById("bar").offsetHeight}px`);
   }
 
   // Renders with changed fields.
@@ -127,7 +125,7 @@ export class TrainingCard {
 
   closed() {
     const { id, state, name, has_rule, iteration = 0, total = Infinity } = this.event, active = ACTIVE.includes(state);
-    if (!active && has_rule && this.showing !== id) return [button(`${name} is learned: watch`, () => this.show())];
+    if (!active && has_rule && this.showing !== id) return [button(`Watch ${name}`, () => this.show())];
     const share = `Learning ${name}: ${Math.floor((100 * iteration) / total)} %`;
     return [button(active ? share : "Grow your own picture", () => this.change({ open: true, choosing: !active }))];
   }
@@ -142,7 +140,7 @@ export class TrainingCard {
       text("Choose or drop a picture or a 3D file. Particles learn it while you watch."),
       row(button("Choose a file", () => this.file.click())),
       row(text("or an emoji"), emoji, button("Grow", typed)),
-      ...(this.event.has_rule ? [row(button(`Show ${this.event.name}`, () => this.show()))] : []),
+      ...(this.event.has_rule ? [row(button(`Watch ${this.event.name}`, () => this.show()))] : []),
     ];
   }
 
@@ -203,10 +201,10 @@ export class TrainingCard {
     return button("Watch", () => this.show());
   }
 
-  // Training loss, and how near the world comes to the picture.
+  // The training's loss, and how near the world comes to the picture.
   quality() {
     const { loss, id } = this.event, parts = [];
-    if (loss !== undefined) parts.push(`training loss ${loss.toPrecision(3)}`);
+    if (loss !== undefined) parts.push(`Loss ${loss.toPrecision(3)}`);
     if (this.psnr !== null && this.showing === id) parts.push(`PSNR ${this.psnr.toFixed(1)} dB`);
     return text(parts.join(" · "));
   }
