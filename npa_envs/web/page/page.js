@@ -213,7 +213,7 @@ class Page {
     // On a phone these lie above the bar.
     for (const one of document.querySelectorAll("#panel, #training:not(.closed)")) {
       const { left, top } = one.getBoundingClientRect();
-      if (left > width / 2) right = Math.min(right, left);
+      if (left > 0.45 * width) right = Math.min(right, left);
       else if (top > height / 4) low = Math.min(low, top);
     }
     return [1 - right / width, 1 - low / height];

@@ -204,8 +204,8 @@ export class TrainingCard {
   // The training's loss, and how near the world comes to the picture.
   quality() {
     const { loss, id } = this.event, parts = [];
-    if (loss !== undefined) parts.push(`Loss ${loss.toPrecision(3)}`);
-    if (this.psnr !== null && this.showing === id) parts.push(`PSNR ${this.psnr.toFixed(1)} dB`);
+    if (loss !== undefined) parts.push(`Loss\u00a0${loss.toPrecision(3)}`);
+    if (this.psnr !== null && this.showing === id) parts.push(`PSNR\u00a0${this.psnr.toFixed(1)}\u00a0dB`);
     return text(parts.join(" · "));
   }
 
