@@ -149,7 +149,7 @@ class Page {
 
   showError(message) {
     $("loading").hidden = $("writing").hidden = true;
-    $("message").textContent = message[0].toUpperCase() + message.slice(1);
+    $("message").textContent = message.charAt(0).toUpperCase() + message.slice(1);
     $("message").hidden = false;
     clearTimeout(this.messageTimer);
     this.messageTimer = setTimeout(() => ($("message").hidden = true), 9000);
