@@ -264,7 +264,8 @@ class Shepherd2DEnv(_GoalReward, GardenEnv):
     | `"sparse"` | 0 where d is at most `tolerance` and the creature is intact, else −1 |
 
     Both reward each step. `env.unwrapped.compute_reward(achieved_goal, desired_goal, info)`
-    returns the same, for one goal or many.
+    returns the same, for one goal or many. `HerReplayBuffer` finds it in `gym.make(id)`;
+    Stable-Baselines3's `check_env` needs `env.unwrapped`.
 
     ## Starting state
 

@@ -294,7 +294,6 @@ PROGRAMS = {
         slice(1, 2),
         "stable_baselines3",
     ),
-    "training": Program(("printed.startswith('random: ')",)),
     "textures": Program(("printed.count('tensor([') == 2",)),
     "point_classification": Program(
         ("'AccuracyRow(step=8' in printed", "points.shape == (1, 128, 2)")
