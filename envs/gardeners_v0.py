@@ -179,6 +179,8 @@ class GardenersVectorEnv(NPAVectorEnv):
         super().__init__(
             count, max_episode_steps=steps, **(CALM | config | {"episode_steps": steps})
         )
+        self.single_observation_spaces = dict.fromkeys(AGENTS, self.single_observation_space)
+        self.single_action_spaces = dict.fromkeys(AGENTS, self.single_action_space)
 
     def reset(self, **options: Any) -> tuple[Any, dict[str, Any]]:
         """Start episodes as `NPAVectorEnv.reset` does; return both agents' observations, infos."""
