@@ -172,13 +172,9 @@ class GardenersVectorEnv(NPAVectorEnv):
     possible_agents = AGENTS
 
     def __init__(self, max_cycles: int = 32, *, world_count: int = 1, **config: Any) -> None:
-        steps, count = (
-            checked_count("max_cycles", max_cycles),
-            checked_count("world_count", world_count),
-        )
-        super().__init__(
-            count, max_episode_steps=steps, **(CALM | config | {"episode_steps": steps})
-        )
+        count = checked_count("world_count", world_count)
+        steps = {"episode_steps": checked_count("max_cycles", max_cycles)}
+        super().__init__(count, max_episode_steps=max_cycles, **(CALM | config | steps))
         self.single_observation_spaces = dict.fromkeys(AGENTS, self.single_observation_space)
         self.single_action_spaces = dict.fromkeys(AGENTS, self.single_action_space)
 
@@ -191,12 +187,10 @@ class GardenersVectorEnv(NPAVectorEnv):
         """Apply both agents' actions; return what PettingZoo's `step` does, of all worlds."""
         if not isinstance(actions, Mapping) or set(actions) != set(AGENTS):
             raise NPAError(f"actions must be given for the agents {AGENTS}, got {shown(actions)}")
-        observation, reward, *flags, infos = super().step(actions)
-        rewards, ends = (
-            {AGENTS[0]: reward, AGENTS[1]: -reward},
-            [dict.fromkeys(AGENTS, f) for f in flags],
-        )
-        return _for_both(observation), rewards, *ends, {agent: dict(infos) for agent in AGENTS}
+        observation, reward, *ends, infos = super().step(actions)
+        ended, cut = (dict.fromkeys(AGENTS, end) for end in ends)
+        rewards = {AGENTS[0]: reward, AGENTS[1]: -reward}
+        return _for_both(observation), rewards, ended, cut, {a: dict(infos) for a in AGENTS}
 
     def state(self) -> Any:
         """Return the worlds as `GardenersEnv.state` does, [B, N, 2 + C + 1]."""

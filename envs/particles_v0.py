@@ -113,7 +113,7 @@ class ParticlesVectorEnv(MultiSpeciesVectorEnv):
     Observations of an agent have shape [B, P], actions [B, A], rewards and flags [B].
     """
 
-    _by_particle = True
+    _of_particles = True
 
 
 def parallel_env(
