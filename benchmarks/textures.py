@@ -63,7 +63,7 @@ def measured(
 def told(tables: dict[str, list[dict[str, Any]]]) -> str:
     """Return the texture metric's ratios as a line of text."""
     return "  ".join(
-        f"{r['step']}: {r['ratio']:.2f} ({r['patches']:.1f} {r['spectra']:.1f} {r['colours']:.1f})"
+        f"{r['step']}: {r['ratio']:.2f} ({r['shapes']:.1f} {r['contrasts']:.1f} {r['colours']:.1f})"
         for r in tables["judge"]
     )
 
@@ -165,8 +165,8 @@ def particles(arguments: argparse.Namespace) -> None:
             with (out / "particles.jsonl").open("a", encoding="utf-8") as file:
                 file.write(json.dumps(line) + "\n")
             print(
-                f"{target:9s} {loss:13s} {found.ratio:6.2f} ({found.patches:.1f} "
-                f"{found.spectra:.1f} {found.colours:.1f})  {seconds:.0f} s",
+                f"{target:9s} {loss:13s} {found.ratio:6.2f} ({found.shapes:.1f} "
+                f"{found.contrasts:.1f} {found.colours:.1f})  {seconds:.0f} s",
                 flush=True,
             )
             with torch.no_grad():

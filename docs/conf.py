@@ -75,7 +75,7 @@ html_theme = "furo"
 # Browsers draw MathML themselves: the site needs no script for formulas, and no network.
 html_math_renderer = "mathml"
 html_title = "npa-envs"
-html_static_path = ["static"]
+html_static_path = ["static/site.css"]
 html_css_files = ["site.css"]
 html_extra_path = ["static/index.html"]
 html_show_sphinx = False

@@ -46,7 +46,7 @@ PLACES = (
     ),
     Place(
         "README.md",
-        "as a site with `make docs`: `build/docs/index.html`\n",
+        "`make docs` builds a site of all pages: `build/docs/index.html`\n",
         "\n**[Play in your browser](<site>gallery.html)**: all 2D rules, nothing to install.\n",
     ),
     Place("README.md", "## Two commands\n\n```sh\n", "git clone <address> && cd <name>\n"),

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import torch
-from films import IMAGES, STILL, FilmedWorld, Frame
+from films import IMAGES, STILL, FilmedWorld, Frame, opened
 from torch import Tensor
 
 import npa_envs
@@ -58,4 +58,4 @@ def frames() -> Iterator[Frame]:
 
 
 if __name__ == "__main__":
-    write_webp(IMAGES / "gecko.webp", frames(), FPS)
+    write_webp(IMAGES / "gecko.webp", opened(frames(), FPS), FPS)

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from films import FPS, IMAGES, STILL, FilmedWorld, Frame
+from films import FPS, IMAGES, STILL, FilmedWorld, Frame, opened
 from torch import Tensor
 
 import npa_envs
@@ -111,9 +111,7 @@ def main(names: list[str]) -> None:
     for task, film in FILMS.items():
         for name in shipped_rules(task):
             if name in names or not names:
-                # What has grown comes first: it is what is seen of a film that does not play.
-                frames = [*film(name)]
-                frames = [frames[-1]] * STILL + frames
+                frames = opened(film(name), FPS)
                 write_webp(FOLDER / f"{name}.webp", frames, FPS, quality=QUALITY.get(task, 50))
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +20,12 @@ STILL = 8
 """Frames for which a film holds its breath before something happens."""
 
 Frame = NDArray[np.uint8]
+
+
+def opened(frames: Iterable[Frame], fps: float) -> list[Frame]:
+    """Show what has grown first, for two seconds: it is all that is seen of a film at rest."""
+    frames = [*frames]
+    return [frames[-1]] * round(2 * fps) + frames
 
 
 class FilmedWorld:

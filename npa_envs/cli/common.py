@@ -242,12 +242,12 @@ class MeasureOptions(RunOptions):
 def check_numbers(options: Any, **least: int) -> None:
     """Check that options, unless None, are at least as in `least`, and `max_seconds` above 0."""
     for name, smallest in least.items():
-        value = getattr(options, name)
+        value, option = getattr(options, name), f"--{name.replace('_', '-')}"
         if value is not None and value < smallest:
-            raise NPAError(f"{name} must be at least {smallest}, got {value}")
+            raise NPAError(f"{option} must be at least {smallest}, got {value}: try {smallest}")
     seconds = getattr(options, "max_seconds", math.inf)
     if not seconds > 0.0:
-        raise NPAError(f"max_seconds must be positive, got {seconds}: leave it out for no limit")
+        raise NPAError(f"--max-seconds must be positive, got {seconds}: leave it out for no limit")
 
 
 def named_values(name: str, arguments: Iterable[str]) -> dict[str, Any]:

@@ -45,7 +45,7 @@ class EvaluateOptions(common.RuleOptions):
     near wounds spread over the body, textures as a whole. Point clouds are always damaged."""
     judge: bool = False
     """Textures only: also measure the texture metric: three distances from the target that no loss
-    uses, as ratios: 1 is the distance of the target drawn by particles."""
+    uses, as ratios: 1 is the distance of a quarter of the target from all of it."""
     json_path: Annotated[Path | None, tyro.conf.arg(name="json")] = None
     """Also write the tables to this JSON file."""
 

@@ -56,7 +56,7 @@ FILM_STEPS = 512
 TITLES: Mapping[str, str] = {
     "healing": "After damage:",
     "pictures": "Each picture by its own code, and by that of the next one, shuffled:",
-    "judge": "Distances that no loss uses; 1 is that of the target drawn by particles:",
+    "judge": "Distances that no loss uses; 1 is that of a quarter of the target from all of it:",
     "changes": "Some steps after a change of the clouds:",
 }
 """Lines above tables of a model card."""
@@ -79,7 +79,7 @@ WORDS: Mapping[str, str] = {
     "end": "that at the end",
     "steps_to_heal": "steps until the mean loss is back",
     "worlds_healed": "worlds whose own loss is back",
-    "ratio": "mean of the three distances: of patches, of spectra and of colours",
+    "ratio": "mean of the three distances: of shapes, of contrasts and of colours",
     "ratio_worst": "that of the worst world",
     "majority": "share of clouds whose majority of particles is right",
     "particle": "share of particles that are right",

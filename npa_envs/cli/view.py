@@ -38,7 +38,7 @@ class ViewOptions(common.DeviceOptions):
       npa-envs view npa/Gardener2DSmall-v0 --policy shipped
     """
 
-    what: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="RULE|RUN|ENV")] = "gecko"
+    what: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="[RULE|RUN|ENV]")] = "gecko"
     """A shipped rule (`npa-envs list`), a rule's file, the folder of a run, or the id of an
     environment: npa/Texture-v0, or MODULE:my/Own-v0 for one that your module registers."""
     policy: str = "zero"

@@ -1,62 +1,71 @@
 """The metric of textures: a picture's distance from the target, by no loss that training uses.
 
-It has three parts: patches, power spectra, colours of pairs of pixels. Each is divided by that of
-particles that draw the target itself, or by 2 % of that of grey noise if this is larger.
+It has three parts: shapes in patches after local contrast normalisation, local contrasts, and
+colours, each at three lengths. Each is divided by that of a quarter of the target from all of it.
 """
 
 from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from npa_envs.errors import NPAError
-from npa_envs.tasks.losses.texture import quantiles
-from npa_envs.tasks.texture import Texture, colour_image
+from npa_envs.tasks.losses.texture import patches, quantiles
+from npa_envs.tasks.texture import Texture
 
-REFERENCE = 128
-"""Resolution [pixels] at which the lengths below hold; at others they are scaled with it."""
-PATCH = 24
-"""Side of a patch [pixels], which no training loss uses."""
-DIRECTIONS = 64
-"""Number of random directions that patches are projected on."""
-BANDS = 7
-"""Number of bands of the wave number, `BAND_RATIO` wide each, up to half a wave per pixel."""
-BAND_RATIO = math.sqrt(2.0)
-ORIENTATIONS = 8
-"""Number of orientations of waves in half a turn."""
-PAIR_DISTANCES = (1, 2, 4, 6, 9, 13, 19, 28)
-"""Distances of the pairs of pixels whose colours are counted [pixels]."""
-PAIR_DIRECTIONS = ((0, 1), (1, 1), (1, 0), (1, -1))
-"""Directions of these pairs: rows down, columns to the right."""
-DRAWINGS = 4
-"""Number of drawings of the target by particles, whose mean distance is the unit."""
+REFERENCE = 256
+"""Resolution [pixels] at which `LENGTHS` hold; at others they are scaled with it."""
+LENGTHS = (8, 24, 64)
+"""Sides of patches [pixels]."""
+SAMPLES = 8
+"""Number of samples along the side of a patch, at lower resolutions one pixel each."""
+MATCHED = 96
+"""Number of patches of the target with which all patches of a picture are compared."""
+QUANTILES = 256
+"""Number of quantiles of each distribution over a picture."""
+MEAN_WEIGHT = 10.0
+"""Weight of the distribution over all matched patches, against that of each."""
+COLOUR_DIRECTIONS = 8
+"""Number of random directions on which colours and density are projected."""
+COVERED = 0.3
+"""Density from which a pixel has its particles' mean colour."""
+FAINT = 0.03
+"""Local contrast below which shapes count less: a standard deviation of colours in [0, 1]."""
+NOISE_SHARE = 0.002
+"""Fraction of the distance of grey noise that is the least unit of each distance."""
+LEAST = (0.0, math.log(1.16) ** 2, 0.05**2)
+"""Least units of shapes, contrasts (by a factor) and colours: differences that are hard to see."""
+DRAWINGS = 3
+"""Number of drawings of the target by particles whose distributions are averaged."""
 
 
 @dataclass(frozen=True)
 class TextureRow:
     """Distances of worlds' pictures from the target at `step`, means over the worlds.
 
-    1 is the distance of particles that draw the target itself. `patches` are sliced Wasserstein
-    distances of patches, `spectra` distances of oriented power spectra, `colours` those of the
-    colours of pairs of pixels. `ratio` is the mean of the three, `ratio_worst` the largest world's.
+    1 is the distance of a quarter of the target from all of it, as particles draw it. `shapes` are
+    distances of patches of equal contrast, `contrasts` those of local contrasts, `colours` those
+    of colours and density. `ratio` is the mean of the three, `ratio_worst` the largest world's.
     """
 
     step: int
     ratio: float
     ratio_worst: float
-    patches: float
-    spectra: float
+    shapes: float
+    contrasts: float
     colours: float
 
 
 class TextureMetric:
     """Computes distances of pictures from the target of a texture task; others raise NPAError.
 
-    It uses float64 and the same random directions each time, so that CPU and GPU agree.
+    Shapes are told by patches of the target: how like each of these the patches of a picture are,
+    as a distribution over all places. All random choices are the same each time.
     """
 
     def __init__(self, task: object) -> None:
@@ -66,134 +75,124 @@ class TextureMetric:
                 "--judge, or give a rule of the task texture"
             )
         self._task = task
-        resolution = task.config.resolution
-        self._scale = resolution / REFERENCE
-        device = task.target_picture.device
-        generator = torch.Generator().manual_seed(0)
-        self._side = max(2, min(resolution, round(PATCH * self._scale)))
-        # Spectra of filters that project patches on random directions, [DIRECTIONS, 4, ...].
-        size = DIRECTIONS, 4, self._side, self._side
-        directions = torch.randn(size, generator=generator).double()
-        directions /= directions.flatten(1).norm(dim=1)[:, None, None, None]
-        filters = torch.zeros(DIRECTIONS, 4, resolution, resolution, dtype=torch.float64)
-        filters[..., : self._side, : self._side] = directions
-        self._filters: Tensor = torch.fft.rfft2(filters.to(device)).conj()
-        bins = _wave_bins(resolution)[:, None] == torch.arange(1, 1 + BANDS * ORIENTATIONS)
-        self._bins = bins.double().to(device)
         wrap = task.target.tiles
-        self._window = torch.ones(resolution, resolution, dtype=torch.float64, device=device)
-        if not wrap:
-            ramp = torch.hann_window(resolution, periodic=False, dtype=torch.float64)
-            self._window = torch.outer(ramp, ramp).to(device)
-        target = _images(task.drawable[None])
-        self._palette = _typical_colours(target[0].flatten(1).T, 12)
-        self._patches = self._projections(target, wrap)
-        self._spectra = self._amplitudes(target)
-        self._colours = self._counts(target, wrap)
-        noise = torch.rand(DRAWINGS, resolution, resolution, 2, generator=generator)
-        grey, density = noise[..., :1].to(device), noise[..., 1:].to(device)
-        noisy = torch.cat((grey * density,) * 3 + (density,), dim=3)
-        drawn = torch.cat([task.drawing(1000 + number) for number in range(DRAWINGS)])
-        least = 0.02 * self._distances(_images(noisy)).mean(0)
-        self._units = torch.maximum(self._distances(_images(drawn)).mean(0), least)
+        generator = torch.Generator().manual_seed(0)
+        turned = torch.randn(4, COLOUR_DIRECTIONS, generator=generator)
+        like = task.target_picture
+        self._turned = (turned / turned.norm(dim=0)).to(like)
+        first, *drawn = (task.drawing(1000 + k, shifted=False) for k in range(1 + DRAWINGS))
+        self._matched: list[Tensor] = []
+        for rows, _, _ in _levels(first, wrap):
+            chosen = torch.randperm(len(rows), generator=generator)[:MATCHED]
+            self._matched.append(rows[chosen.to(rows.device)].T)
+        fields = [self._fields(picture, wrap) for picture in drawn]
+        self._expected = [
+            torch.stack([_distribution(field) for field in same]).mean(0)
+            for same in zip(*fields, strict=True)
+        ]
+        noise = torch.rand(1, *like.shape[:2], 2, generator=generator)
+        grey, density = noise[..., :1].to(like), noise[..., 1:].to(like)
+        noisy = self._fields(torch.cat((grey * density,) * 3 + (density,), dim=3), True)
+        units = torch.maximum(
+            torch.stack([self._distances(quarter) for quarter in _quarters(fields[0])]).mean(0),
+            NOISE_SHARE * self._distances(noisy),
+        )
+        self._units = torch.maximum(units, torch.tensor(LEAST).to(units))
 
     @torch.no_grad()
     def __call__(self, pictures: Tensor) -> Tensor:
-        """Return patches, spectra, colours (`TextureRow`) of each picture, float64, [B, 3]."""
-        if pictures.shape[1:] != self._task.target_picture.shape:
+        """Return shapes, contrasts, colours (`TextureRow`) of each picture, float64, [B, 3]."""
+        like = self._task.target_picture
+        if pictures.shape[1:] != like.shape:
             raise NPAError(
                 f"pictures must have shape [B, R, R, 4] with R as the target's "
                 f"{self._task.config.resolution}, got {tuple(pictures.shape)}"
             )
-        images = _images(pictures.to(self._task.target_picture.device))
-        return self._distances(images) / self._units
+        distances = [self._distances(self._fields(p[None].to(like), True)) for p in pictures]
+        return (torch.stack(distances) / self._units).mean(1)
 
     def row(self, x: Tensor, s: Tensor, step: int) -> TextureRow:
         """Return the row of worlds x and s at `step`, as the task draws them."""
         ratios = self(self._task.picture(x, s))
         each = ratios.mean(1)
-        patches, spectra, colours = ratios.mean(0).tolist()
-        return TextureRow(step, each.mean().item(), each.max().item(), patches, spectra, colours)
+        shapes, contrasts, colours = ratios.mean(0).tolist()
+        return TextureRow(step, each.mean().item(), each.max().item(), shapes, contrasts, colours)
 
-    def _distances(self, images: Tensor) -> Tensor:
+    def _fields(self, picture: Tensor, wrap: bool) -> list[Tensor]:
+        """Return likeness to matched patches, log contrast and colours for each length, [F, S, S].
+
+        S is the number of places along a side.
+        """
+        fields = []
+        for (rows, variance, colours), matched in zip(
+            _levels(picture, wrap), self._matched, strict=True
+        ):
+            side = math.isqrt(len(rows))
+            likeness = (rows @ matched).T.reshape(-1, side, side)
+            if wrap:  # The last row and column are the first again.
+                likeness = likeness[:, :-1, :-1]
+            fields += [likeness, 0.5 * variance.log()[None]]
+            fields.append((self._turned.T @ colours.flatten(1)).view(-1, *colours.shape[1:]))
+        return fields
+
+    def _distances(self, fields: list[Tensor]) -> Tensor:
+        """Return distances of fields from the target's, float64, [lengths, 3]."""
         distances = []
-        for image in images[:, None]:
-            patches = (self._projections(image, True) - self._patches).square().mean()
-            spectra = (self._amplitudes(image) - self._spectra).square().sum()
-            colours = (self._counts(image, True).sqrt() - self._colours.sqrt()).square().sum()
-            distances.append(torch.stack((patches, spectra, colours)))
-        return torch.stack(distances)
-
-    def _projections(self, image: Tensor, wrap: bool) -> Tensor:
-        """Project an R x R image's patches on directions; return quantiles, [DIRECTIONS, R²]."""
-        waves = torch.fft.rfft2(image)
-        projected = torch.fft.irfft2((waves * self._filters).sum(1), s=image.shape[-2:])
-        count = image.shape[-1] ** 2
-        if not wrap:  # Only patches that do not cross the image's edges.
-            inside = image.shape[-1] - self._side + 1
-            projected = projected[:, :inside, :inside]
-        return quantiles(projected.flatten(1), count)
-
-    def _amplitudes(self, image: Tensor) -> Tensor:
-        """Return the square root of the power in each channel and each bin of waves, [4, bins]."""
-        flat = (image - image.mean(dim=(2, 3), keepdim=True)) * self._window
-        power = torch.fft.fft2(flat, norm="forward").abs().square() / self._window.square().mean()
-        sums: Tensor = power[0].flatten(1) @ self._bins
-        return sums.sqrt()
-
-    def _counts(self, image: Tensor, wrap: bool) -> Tensor:
-        """Return fractions of pairs of pixels with each two of K colours, [pairs, K, K]."""
-        away = (image[0].movedim(0, -1)[..., None, :] - self._palette).square().sum(-1)
-        near = torch.exp(-0.5 * away / 0.15**2)
-        # One more entry for colours that are near no other.
-        near = torch.cat((near, torch.full_like(near[..., :1], 0.05)), dim=-1)
-        near = near / near.sum(-1, keepdim=True)
-        result = []
-        side = near.shape[0]
-        for distance, (down, across) in itertools.product(PAIR_DISTANCES, PAIR_DIRECTIONS):
-            steps = max(1, round(distance * self._scale))
-            moved = near.roll((-down * steps, -across * steps), dims=(0, 1))
-            start = near
-            if not wrap:
-                rows = slice(0, side - down * steps)
-                columns = slice(max(0, -across * steps), side - max(0, across * steps))
-                start, moved = near[rows, columns], moved[rows, columns]
-            start, moved = start.flatten(0, 1), moved.flatten(0, 1)
-            result.append(start.T @ moved / len(start))
-        return torch.stack(result)
+        for number, (field, expected) in enumerate(zip(fields, self._expected, strict=True)):
+            apart = (_distribution(field) - expected).double()
+            weight = MEAN_WEIGHT if number % 3 == 0 else 0.0
+            distances.append(apart.square().mean() + weight * apart.mean(0).square().mean())
+        return torch.stack(distances).view(-1, 3)
 
 
-def _images(pictures: Tensor) -> Tensor:
-    """Return red, green, blue and density of pictures [B, R, R, 4], float64, [B, 4, R, R]."""
-    channels = pictures.double().movedim(-1, 1)
-    # The plain density, no power of it, as the faintest parts of edges should count little.
-    return torch.cat((colour_image(channels), channels[:, 3:]), dim=1)
+def _levels(picture: Tensor, wrap: bool) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
+    """Yield patches [M, E], local variance [S, S] and colours with density [4, S, S] by length.
+
+    `picture` is one, [1, R, R, 4]. Patches have equal contrast and length 1, but for faint ones.
+    """
+    channels = picture[0].movedim(-1, 0)
+    sums, density = channels[:3], channels[3:]
+    # Mean colours of particles: where these are dense or sparse is noise.
+    even = torch.cat((sums / density.clamp_min(COVERED), 0.5 * (density / COVERED).clamp_max(1.0)))
+    shown = torch.cat((sums / density.clamp_min(1.0), 0.5 * density.clamp_max(1.0)))
+    resolution = picture.shape[1]
+    for length in LENGTHS:
+        side = min(resolution, round(SAMPLES * REFERENCE / length))
+        smaller = _area_means(side, resolution).to(picture)
+        around = _gaussian_means(side, 0.5 * SAMPLES, wrap).to(picture)
+        image = smaller @ even @ smaller.T
+        apart = image - around @ image @ around.T
+        variance = (around @ apart.square().sum(0) @ around.T).clamp_min(0.0)
+        rows = patches((apart / (variance + FAINT**2).sqrt())[None], SAMPLES, stride=1, wrap=wrap)
+        rows = rows[0] / (rows[0].norm(dim=1, keepdim=True) + 1e-3)
+        near = _gaussian_means(side, 1.5, wrap).to(picture) @ smaller
+        yield rows, variance + (0.5 * FAINT) ** 2, near @ shown @ near.T
 
 
-def _wave_bins(resolution: int) -> Tensor:
-    """Return each wave's bin by wave number and orientation, from 1 on, int64, [R²]; 0: none."""
-    waves = torch.fft.fftfreq(resolution, dtype=torch.float64)
-    down, across = torch.meshgrid(waves, waves, indexing="ij")
-    length = torch.hypot(down, across)
-    longest = 0.5 * REFERENCE / resolution
-    band = BANDS + torch.floor(torch.log(length / longest + 1e-300) / math.log(BAND_RATIO))
-    # The first and the last band take all longer and all shorter waves.
-    band = band.clamp(0, BANDS - 1)
-    turn = torch.atan2(down, across) % math.pi
-    orientation = torch.floor(turn / math.pi * ORIENTATIONS + 0.5) % ORIENTATIONS
-    bins = 1 + band * ORIENTATIONS + orientation
-    return torch.where(length > 0.0, bins, torch.zeros_like(bins)).long().flatten()
+def _area_means(count: int, resolution: int) -> Tensor:
+    """Return the matrix [count, R] that takes means of R pixels over `count` equal intervals."""
+    edges = torch.arange(count + 1, dtype=torch.float64) * resolution / count
+    pixels = torch.arange(resolution, dtype=torch.float64)
+    shared = torch.minimum(edges[1:, None], pixels + 1.0) - torch.maximum(edges[:-1, None], pixels)
+    return shared.clamp_min(0.0) * count / resolution
 
 
-def _typical_colours(colours: Tensor, count: int) -> Tensor:
-    """Return `count` = K typical colours [K, F] of colours [M, F], the centres of k-means."""
-    centres = colours.mean(0, keepdim=True)
-    for _ in range(count - 1):
-        away = torch.cdist(colours, centres).amin(1)
-        centres = torch.cat((centres, colours[away.argmax()][None]))
-    for _ in range(20):
-        nearest = torch.cdist(colours, centres).argmin(1)
-        chosen = torch.nn.functional.one_hot(nearest, count).to(colours)
-        sums, sizes = chosen.T @ colours, chosen.sum(0)[:, None]
-        centres = torch.where(sizes > 0.0, sums / sizes.clamp_min(1.0), centres)
-    return centres
+def _gaussian_means(side: int, sigma: float, wrap: bool) -> Tensor:
+    """Return the matrix [side, side] of means weighted by a Gaussian of `sigma` samples."""
+    places = torch.arange(side, dtype=torch.float64)
+    away = places[:, None] - places
+    if wrap:
+        away = away - side * (away / side).round()
+    weights = torch.exp(-0.5 * (away / sigma).square())
+    return weights / weights.sum(1, keepdim=True)
+
+
+def _distribution(field: Tensor) -> Tensor:
+    """Return the quantiles of a field [F, S, S] over its places, [F, QUANTILES]."""
+    return quantiles(field.flatten(1), QUANTILES)
+
+
+def _quarters(fields: list[Tensor]) -> Iterator[list[Tensor]]:
+    """Yield the fields [F, S, S] of each quarter of a picture."""
+    for down, across in itertools.product((0, 1), repeat=2):
+        yield [field.chunk(2, 1)[down].chunk(2, 2)[across] for field in fields]

@@ -526,7 +526,7 @@ MORPHOGENESIS2D_PRESETS = presets_of(
         task=Morphogenesis2DConfig(
             escape_share=2e-4, damage_radius=0.2, cut_share=0.8, cut_anywhere=True, **_STABILITY,
         ),
-        repeats=1, iterations=12_000, pool_size=64, steps=(48, 80), optimiser="muon",
+        repeats=1, iterations=15_000, pool_size=64, steps=(48, 80), optimiser="muon",
         learning_rate=3e-3, weight_decay=0.1, schedule="cosine", max_age_range=(16, 16_384),
         damage_and_keep_share=0.7, damage_share=0.125, stillness_min_age=1024, stillness_weight=2.0,
         stillness_power=4.0, dead_zone=1e-3, initial_rule="heart-first", wound_chance=0.2,

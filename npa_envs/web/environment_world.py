@@ -133,7 +133,8 @@ class EnvironmentWorld(LiveWorld):
         return {"positions", "states"} if self._physics.moving else {"states"}
 
     def _shows(self) -> list[str]:
-        return shows_of(self._physics.state_dim, species=False)
+        coloured = not getattr(self._inner.task.config, "class_count", 0)
+        return shows_of(self._physics.state_dim, species=False, coloured=coloured)
 
     def _run(self, steps: int) -> None:
         for _ in range(steps):

@@ -262,7 +262,7 @@ class Colouring:
                 tints = world.x.new_tensor(MASK_COLOURS, dtype=torch.float32)
                 return _bytes(tints[_or_zeros(world.updated, world).long()])
             case _:
-                channel = int(show.removeprefix("state "))
+                channel = int(show.split()[1])
                 return _bytes(signed_colours(world.s[0, :, channel]))
 
     def _components(self, s: Tensor) -> Tensor:
@@ -287,14 +287,16 @@ class Colouring:
         return torch.nn.functional.pad(colours, (0, 3 - count), value=0.5)
 
 
-def shows_of(state_dim: int, *, species: bool = True) -> list[str]:
+def shows_of(state_dim: int, *, species: bool = True, coloured: bool = False) -> list[str]:
     """Return what colours can show of particles with `state_dim` state channels.
 
     "components" are the first three principal components of the states, "mask" is which particles
-    the last step updated. Without `species` there is one species, and masks are unknown.
+    the last step updated. Without `species` there is one species, and masks are unknown. With
+    `coloured`, the last three states are colours, which their names say.
     """
     last = ("species", "speed", "mask") if species else ("speed",)
-    states = (f"state {k}" for k in range(state_dim))
+    tints = dict(enumerate((" (red)", " (green)", " (blue)"), state_dim - 3)) if coloured else {}
+    states = (f"state {k}{tints.get(k, '')}" for k in range(state_dim))
     return ["colours", "density", "components", *last, *states]
 
 

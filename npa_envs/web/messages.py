@@ -146,7 +146,7 @@ class Brush(NamedTuple):
 
 
 BRUSHES = {
-    "wipe": Brush("states", "Wipe: sets states to zero; many rules heal it", "frame"),
+    "wipe": Brush("states", "Wipe: sets states to zero; see what grows back", "frame"),
     "cut": Brush("positions", "Cut: opens a slit along the line that you draw", "line"),
     "push": Brush(
         "positions",

@@ -212,7 +212,7 @@ class RuleWorld(LiveWorld):
         return ranges
 
     def _shows(self) -> list[str]:
-        return shows_of(self.main.rule.state_dim)
+        return shows_of(self.main.rule.state_dim, coloured=not self.main.rule.readout_dim)
 
     def _set(self, name: str, value: Any) -> bool:
         if name == "rule":

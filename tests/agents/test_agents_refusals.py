@@ -214,7 +214,7 @@ REFUSED = {
         ({}, "needs a budget"),
         ({"learning_seconds": 0.0}, "seconds must be positive"),
         ({"particle_steps": 0.5}, "particle-steps must be positive"),
-        (TIMED | {"seed_count": 0}, "seed_count must be at least 1"),
+        (TIMED | {"seed_count": 0}, "--seed-count must be at least 1"),
         (TIMED | {"seed_count": 101}, "seed_count must be at most 100, got 101"),
         (TIMED | {"methods": ("a=zero", "a=random")}, "got a=zero and a=random: rename"),
         (TIMED | {"tasks": ("mixin",)}, "did you mean 'mixing'"),

@@ -116,5 +116,5 @@ def test_the_list_tells_every_score(capsys):
         for value, step in told:
             half = 0.501 * 10.0 ** -len(value.partition(".")[2])
             assert float(value) == pytest.approx(stored[int(step)], abs=half)
-    assert "gecko       10880 weights  0.090 at 128, 0.089 at 512, 0.100 at 4096" in text
+    assert "gecko       10880 weights  0.078 at 128, 0.075 at 512, 0.088 at 4096" in text
     assert "digits      28170 weights  98.1% at 32" in text

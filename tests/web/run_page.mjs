@@ -26,9 +26,9 @@ let waiting = [];
 Object.assign(globalThis, {
   document: {
     getElementById: element, createElement: makeElement, documentElement: makeElement(), body: makeElement(),
-    activeElement: null,
+    activeElement: null, querySelectorAll: () => [],
   },
-  window: globalThis, location: { search: "?painter=canvas" }, innerWidth: 1000, devicePixelRatio: 1,
+  window: globalThis, location: { search: "?painter=canvas" }, innerWidth: 1000, innerHeight: 900, devicePixelRatio: 1,
   getComputedStyle: () => ({ backgroundColor: "rgb(0, 0, 0)", color: "rgb(0, 0, 0)" }), matchMedia: () => ({}), addEventListener() {},
   ResizeObserver: class { observe() {} }, Option: class {},
   requestAnimationFrame: (act) => waiting.push(act),

@@ -449,7 +449,7 @@ def test_the_command_writes_pages_and_collections(tmp_path, capsys):
         (["gecko", "--title", "mine"], "title is for pages, got --title with a collection"),
         (["gecko", "--gallery"], "gallery is for pages, got --gallery with"),
         (["--gallery"], "gallery is for pages, got --gallery with"),
-        (["gecko", "--particle-count", "0"], "particle_count must be at least 1"),
+        (["gecko", "--particle-count", "0"], "--particle-count must be at least 1"),
         ([str(tmp_path / "unfinished")], "must hold the rule.safetensors of a run"),
     ):
         assert main(["export-web", *words, "--out", str(collection)]) == 2

@@ -304,7 +304,8 @@ def test_settings_change_the_world_and_its_description(world):
 
 
 def test_another_rule_is_another_world(world):
-    put(world, show="state 15")
+    assert world.describe()["shows"][-4:-2] == ["state 12", "state 13 (red)"]
+    put(world, show="state 15 (blue)")
     assert put(world, rule="dots")
     description = world.describe()
     expected = {"rule": "dots", "box": [2.0, 2.0], "half_width": 1.0}

@@ -122,24 +122,23 @@ def test_a_page_begins_with_a_brush_that_heals_and_says_what_it_does(run):
         return [first, keys.length, last, page.brushes.chosen.name];
     """)
     removing = "Remove: takes particles away, for good"
-    wiping = "Wipe: sets states to zero; many rules heal it"
+    wiping = "Wipe: sets states to zero; see what grows back"
     assert shown == [["wipe", wiping], 10, ["remove", removing], "look"]
 
 
-def test_graft_is_refused_with_its_reason_where_no_other_rule_fits(run):
-    hints = run("""
+def test_graft_is_offered_where_another_rule_fits_and_species_shown_where_there_are_two(run):
+    offered = run("""
         return [["a"], ["a", "b"]].map((others) => {
-          listen({ ...world, others });
-          element("brushes").children.find((one) => one.dataset.brush === "graft").onclick();
-          return [page.brushes.chosen.name, element("hint").textContent];
+          listen({ ...world, others, species: others, shows: ["colours", "species"] });
+          const brushes = element("brushes").children.map((one) => one.dataset.brush);
+          return [brushes.includes("graft"), element("show").dataset.names];
         });
     """)
-    assert [name for name, _ in hints] == ["wipe", "graft"]
-    assert "no other rule fits" in hints[0][1]
+    assert offered == [[False, "colours"], [True, "colours\nspecies"]]
 
 
 def test_all_that_a_page_shows_has_a_meaning(run):
-    shows = [*shows_of(2), "state 15"]
+    shows = [*shows_of(3, coloured=True), "state 15"]
     meanings = run(f"""
         return {json.dumps(shows)}.map((show) => {{
           listen({{ ...world, show }});
@@ -147,7 +146,7 @@ def test_all_that_a_page_shows_has_a_meaning(run):
         }});
     """)
     assert min(map(len, meanings)) > 20
-    assert len(set(meanings)) == len(shows) - 2
+    assert len(set(meanings)) == len(shows) - 3
     classes = run("""
         listen({ ...world, class_count: 11 });
         return element("meaning").textContent;

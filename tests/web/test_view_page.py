@@ -204,6 +204,37 @@ def test_on_a_phone_fingers_brush_and_the_settings_fold(shown):
 
 
 @pytest.mark.slow
+def test_in_a_low_window_the_buttons_are_one_row_that_scrolls(shown):
+    page, _ = shown(size=(780, 437))
+    assert page.run("document.getElementById('panel').hidden")
+    click(page, "fold")
+    take(page, "remove")
+    buttons = "[...document.querySelectorAll('.bar button')].map((b) => b.getBoundingClientRect())"
+    assert len(page.run(f"[...new Set({buttons}.map(({{ top }}) => top))]")) == 1
+    chosen = "document.querySelector('[aria-checked=true]')"
+    assert page.run(f"{chosen}.getBoundingClientRect().right") < 440
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("painter", ["canvas", "webgl2"])
+def test_the_world_lies_beside_the_open_card_and_reaches_below_it(shown, painter, tmp_path):
+    page, _ = shown(query=f"?painter={painter}")
+    pause(page)
+    page.run("document.querySelector('.stage').append(Object.assign("
+             "document.createElement('section'), { id: 'training' }))")  # fmt: skip
+    ends = []
+    for zoom in (1, 4):
+        page.run(f"(document.page.camera.zoom = {zoom}, document.page.dirty = true)")
+        time.sleep(0.5)
+        picture = picture_of(page, tmp_path / "page.png")[200:600, :990]
+        ends.append((np.ptp(picture, axis=2).max(axis=0) > 60).nonzero()[0][-1])
+    # Free are 684 of 992 columns; the right end of the magnified world lies below the card.
+    assert pixel_of(page, 0.0, 0.0)[0] == pytest.approx(342)
+    assert (ends[1] - 342) / 4 == pytest.approx(ends[0] - 342, abs=8)
+    assert ends[1] > 700
+
+
+@pytest.mark.slow
 def test_the_card_stops_a_training_once(shown):
     page, _ = shown()
     before, after, sent = page.run("""(async () => {

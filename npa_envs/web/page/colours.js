@@ -35,7 +35,7 @@ export class Colouring {
     } else if (show === "mask") {
       writeColours(bytes, (i) => entryOf(mask, live.updated[i]));
     } else {
-      const channel = Number(show.slice("state ".length)), gain = this.constants.STATE_GAIN;
+      const channel = parseInt(show.slice("state ".length)), gain = this.constants.STATE_GAIN;
       writeColours(bytes, (i) => between(state, 1 / (1 + Math.exp(-gain * world.s[i * live.channels + channel]))));
     }
     return new Uint8Array(bytes.buffer);

@@ -8,7 +8,7 @@ export class Camera {
     this.halfWidth = halfWidth;
     this.centre = [0, 1, 2].map((k) => centre[k] ?? 0);
     this.zoom = 1;
-    this.covered = 0; // fraction of the canvas's height that controls cover, at its lower edge
+    this.covered = [0, 0]; // fractions of the canvas that controls cover, at its right and lower edges
     this.azimuth = 0;
     this.elevation = dimension === 3 ? 15 : 0;
   }
@@ -32,12 +32,12 @@ export class Camera {
 
   // Length units of a pixel on the canvas, at the depth of the centre.
   unit(width, height) {
-    return (2 * this.halfWidth) / (this.zoom * Math.min(width, this.open(height)));
+    return (2 * this.halfWidth) / (this.zoom * Math.min(...this.open(width, height)));
   }
 
-  // Rows of the canvas that no controls cover; the centre lies in their middle.
-  open(height) {
-    return height * (1 - this.covered);
+  // Columns and rows of the canvas that no controls cover; the centre lies in their middle.
+  open(width, height) {
+    return [width * (1 - this.covered[0]), height * (1 - this.covered[1])];
   }
 
   // Projects a position to [column, row, nearness, scale]; pixels from the upper left corner.
@@ -45,13 +45,14 @@ export class Camera {
     const offset = this.centre.map((middle, k) => (position[k] ?? 0) - middle);
     const [across, up, near] = this.axes.map((axis) => dot(axis, offset));
     const scale = this.distance ? this.distance / (this.distance - near) : 1;
-    const unit = this.unit(width, height);
-    return [width / 2 + (across * scale) / unit, this.open(height) / 2 - (up * scale) / unit, near, scale];
+    const unit = this.unit(width, height), [columns, rows] = this.open(width, height);
+    return [columns / 2 + (across * scale) / unit, rows / 2 - (up * scale) / unit, near, scale];
   }
 
   // The position under a pixel of the canvas, at a nearness: the distance from the centre towards the viewer.
   position(column, row, width, height, near = 0) {
-    const move = this.movement(column - width / 2, row - this.open(height) / 2, width, height, near);
+    const [columns, rows] = this.open(width, height);
+    const move = this.movement(column - columns / 2, row - rows / 2, width, height, near);
     return this.centre.map((middle, k) => middle + move[k] + near * this.axes[2][k]);
   }
 
@@ -127,7 +128,7 @@ function tiles(scene, width, height) {
   const range = (size, side, middle) => {
     const half = (size * unit) / 2 + SOFT_REACH * scene.spot;
     const first = Math.round((middle - half) / side), last = Math.round((middle + half) / side);
-    return Array.from({ length: Math.min(last - first + 1, 8) }, (_, k) => (first + k) * side);
+    return Array.from({ length: Math.min(last - first + 1, 16) }, (_, k) => (first + k) * side);
   };
   const rows = range(height, box[1], camera.centre[1]);
   return range(width, box[0], camera.centre[0]).flatMap((x) => rows.map((y) => [x, y, 0]));
@@ -141,14 +142,15 @@ uniform vec3 right, up, toward, centre, offset;
 uniform vec2 unit;        // device units a length unit
 uniform float distance_;  // of the camera; 0: no perspective
 uniform float nearest;    // nearness that counts as the front
-uniform float covered;    // fraction of the height that controls cover
+uniform vec2 covered;     // fractions of width and height that controls cover
 uniform float size;       // pixels at the depth of the centre
 out vec3 tint; out float light;
 void main() {
   vec3 p = position + offset - centre;
   float near = dot(p, toward);
   float scale = distance_ > 0.0 ? distance_ / max(distance_ - near, 1e-3) : 1.0;
-  gl_Position = vec4(dot(p, right) * scale * unit.x, dot(p, up) * scale * unit.y + covered, -near / nearest, 1.0);
+  vec2 at = vec2(dot(p, right), dot(p, up)) * scale * unit + vec2(-covered.x, covered.y);
+  gl_Position = vec4(at, -near / nearest, 1.0);
   gl_PointSize = size * scale;
   tint = colour;
   light = distance_ > 0.0 ? clamp(0.95 + 0.5 * near / nearest, 0.45, 1.15) : 1.0;
@@ -285,7 +287,7 @@ class GlPainter {
     gl.uniform2f(program.unit, 2 / (unit * width), 2 / (unit * height));
     gl.uniform1f(program.distance_, camera.distance);
     gl.uniform1f(program.nearest, 2 * camera.halfWidth);
-    gl.uniform1f(program.covered, camera.covered);
+    gl.uniform2f(program.covered, ...camera.covered);
   }
 
   drawTrails(scene, width, height) {
@@ -414,15 +416,15 @@ class PlainPainter {
 function projected({ positions, dimension, camera }, offset, width, height) {
   const count = positions.length / dimension, spots = new Float32Array(4 * count);
   const [right, up, toward] = camera.axes, unit = camera.unit(width, height), { distance, centre } = camera;
-  const middle = camera.open(height) / 2;
+  const [columns, rows] = camera.open(width, height);
   for (let k = 0; k < count; k++) {
     const x = positions[dimension * k] + offset[0] - centre[0];
     const y = positions[dimension * k + 1] + offset[1] - centre[1];
     const z = (dimension === 3 ? positions[3 * k + 2] : 0) + offset[2] - centre[2];
     const near = x * toward[0] + y * toward[1] + z * toward[2];
     const scale = distance ? distance / Math.max(distance - near, 1e-3) : 1;
-    spots[4 * k] = width / 2 + ((x * right[0] + y * right[1] + z * right[2]) * scale) / unit;
-    spots[4 * k + 1] = middle - ((x * up[0] + y * up[1] + z * up[2]) * scale) / unit;
+    spots[4 * k] = columns / 2 + ((x * right[0] + y * right[1] + z * right[2]) * scale) / unit;
+    spots[4 * k + 1] = rows / 2 - ((x * up[0] + y * up[1] + z * up[2]) * scale) / unit;
     spots[4 * k + 2] = near / unit;
     spots[4 * k + 3] = scale;
   }

@@ -126,8 +126,7 @@ class Page {
       // Also for undrawn frames of the former world: the engine waits for each.
       this.reportDrawn();
       const first = world.dimension === 2 ? world.tools[0]?.name : "look", { name: chosen } = this.brushes.chosen;
-      const usable = world.tools.some((brush) => brush.name === chosen && !this.brushes.lack(brush));
-      const keeps = before.dimension === world.dimension && usable;
+      const keeps = before.dimension === world.dimension && this.brushes.offered.slice(1).some(({ name }) => name === chosen);
       this.brushes.choose(keeps ? chosen : first);
     }
     if (before.rule !== world.rule || before.seed !== world.seed) {
@@ -150,7 +149,7 @@ class Page {
 
   showError(message) {
     $("loading").hidden = $("writing").hidden = true;
-    $("message").textContent = message;
+    $("message").textContent = message.charAt(0).toUpperCase() + message.slice(1);
     $("message").hidden = false;
     clearTimeout(this.messageTimer);
     this.messageTimer = setTimeout(() => ($("message").hidden = true), 9000);
@@ -206,6 +205,20 @@ class Page {
     }
   }
 
+  // Fractions of the canvas that controls cover, at its right and lower edges; a box may also extend below them.
+  get covered() {
+    const { canvas: { clientWidth: width, clientHeight: height }, world: { box } } = this;
+    if (box) return [0, 0];
+    let right = width, low = $("bar").offsetTop;
+    // On a phone these lie above the bar.
+    for (const one of document.querySelectorAll("#panel, #training:not(.closed)")) {
+      const { left, top } = one.getBoundingClientRect();
+      if (left > 0.45 * width) right = Math.min(right, left);
+      else if (top > height / 4) low = Math.min(low, top);
+    }
+    return [1 - right / width, 1 - low / height];
+  }
+
   draw({ still = false } = {}) {
     const { canvas, frame, world, camera } = this;
     // More pixels are invisible, and slow without a GPU.
@@ -213,9 +226,7 @@ class Page {
     const width = Math.round(canvas.clientWidth * ratio), height = Math.round(canvas.clientHeight * ratio);
     if (!width || !height) return;
     if (canvas.width !== width || canvas.height !== height) Object.assign(canvas, { width, height });
-    // A box may also extend below the bar, and below the panel, which on a phone is above the bar.
-    const edge = Math.min($("bar").offsetTop, $("panel").getBoundingClientRect().top || Infinity);
-    camera.covered = world.box ? 0 : (canvas.clientHeight - edge) / canvas.clientHeight;
+    camera.covered = this.covered;
     this.painter.draw({
       positions: frame?.positions ?? new Float32Array(), colours: frame?.colours ?? new Uint8Array(),
       dimension: world.dimension, box: world.box, spot: world.spot * $("size").value, camera,
@@ -249,25 +260,27 @@ class Brushes {
       page.camera.magnify(Math.exp(-event.deltaY * 0.0015));
       page.dirty = true;
     }, { passive: false });
-    new ResizeObserver(() => (page.dirty = true)).observe(canvas);
+    const sizes = new ResizeObserver(() => {
+      document.documentElement.style.setProperty("--bar", `${$("bar").offsetHeight}px`);
+      page.dirty = true;
+    });
+    [canvas, $("bar")].forEach((one) => sizes.observe(one));
   }
 
+  // The world's brushes that can do something in it: a graft takes a second rule.
   get offered() {
-    return [LOOK, ...this.page.world.tools];
+    const { tools, others, species } = this.page.world, alone = new Set([...others, ...species]).size < 2;
+    return [LOOK, ...tools.filter(({ name }) => name !== "graft" || !alone)];
   }
 
-  // Why a brush that the world offers can do nothing in it, or "".
-  lack({ name }) {
-    const { others, species } = this.page.world, fits = new Set([...others, ...species]).size > 1;
-    return name !== "graft" || fits ? "" : "Graft: no other rule fits; it needs the same ε0, channels and dimension";
-  }
-
-  // Takes the brush of a name, or "look" if the world does not offer it or it can do nothing.
+  // Takes the brush of a name, or "look" if the world does not offer it.
   choose(name) {
-    this.chosen = this.offered.find((brush) => brush.name === name && !this.lack(brush)) ?? LOOK;
+    this.chosen = this.offered.find((brush) => brush.name === name) ?? LOOK;
     this.note = "";
-    for (const button of $("brushes").children)
+    for (const button of $("brushes").children) {
       button.setAttribute("aria-checked", String(button.dataset.brush === this.chosen.name));
+      if (button.dataset.brush === this.chosen.name) button.scrollIntoView({ block: "nearest", inline: "nearest" });
+    }
     if (this.chosen.takes === "rule") $("brush").open = true;
     this.showHint();
     if (this.chosen === LOOK) $("cursor").hidden = true;
@@ -453,7 +466,7 @@ class Controls {
       input.oninput = () => { output.textContent = short(+input.value); page.dirty = true; };
       input.oninput();
     }
-    this.fold(innerWidth <= 760);
+    this.fold(innerWidth <= 760 || innerHeight <= 500);
     this.showPlaying();
     addEventListener("keydown", (event) => this.key(event));
   }
@@ -467,7 +480,8 @@ class Controls {
     const other = world.others.includes($("other").value) && before.rule === world.rule
       ? $("other").value : world.others.find((name) => name !== world.rule);
     options($("other"), world.others, other);
-    options($("show"), world.shows, world.show, WORDS);
+    const shows = world.shows.filter((name) => name !== "species" || world.species.length > 1 || name === world.show);
+    options($("show"), shows, world.show, WORDS);
     const classes = Array.from({ length: world.class_count }, (_, k) => `${k} ${CLASSES[k % CLASSES.length]}`);
     $("meaning").textContent = world.show === "colours" && classes.length
       ? `Which class each particle takes this for: ${classes.join(", ")}; grey where it is not sure.`
@@ -508,16 +522,13 @@ class Controls {
   }
 
   showBrushes() {
-    const { brushes } = this.page, names = brushes.offered.map((brush) => brushes.lack(brush) || brush.label).join();
+    const { brushes } = this.page, names = brushes.offered.map(({ label }) => label).join();
     if ($("brushes").dataset.names === names) return;
     $("brushes").dataset.names = names;
-    $("brushes").replaceChildren(...brushes.offered.map((brush, k) => {
-      const { name, label } = brush, lack = brushes.lack(brush);
+    $("brushes").replaceChildren(...brushes.offered.map(({ name, label }, k) => {
       const button = make("button", {
-        innerHTML: icon(name, label.split(":")[0]), title: `${lack || label} (${(k + 1) % 10})`,
-        onclick: () => { if (lack) $("hint").textContent = lack; else brushes.choose(name); },
+        innerHTML: icon(name, label.split(":")[0]), title: `${label} (${(k + 1) % 10})`, onclick: () => brushes.choose(name),
       });
-      if (lack) button.setAttribute("aria-disabled", "true");
       button.dataset.brush = name;
       button.setAttribute("role", "radio");
       return button;
@@ -620,10 +631,10 @@ class Film {
     const { recording, page: { canvas, camera } } = this, now = performance.now();
     if (!recording?.picture || now - recording.last < FILM_PAUSE) return;
     recording.last = now;
-    const { picture } = recording, height = camera.open(canvas.height);
-    const side = Math.min(canvas.width, height);
+    const { picture } = recording, [width, height] = camera.open(canvas.width, canvas.height);
+    const side = Math.min(width, height);
     picture.getContext("2d").drawImage(
-      canvas, (canvas.width - side) / 2, (height - side) / 2, side, side, 0, 0, FILM_SIZE, FILM_SIZE);
+      canvas, (width - side) / 2, (height - side) / 2, side, side, 0, 0, FILM_SIZE, FILM_SIZE);
     picture.toBlob((blob) => { if (blob) this.page.send(blob); }, "image/jpeg", QUALITY);
   }
 }

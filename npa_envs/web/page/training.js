@@ -105,8 +105,7 @@ export class TrainingCard {
     const again = [...card.querySelectorAll("button, a")].find((one) => one.textContent === focused.textContent);
     if (inside) again?.focus();
     card.className = shown;
-    // On a phone the card lies above the bar.
-    card.style.setProperty("--bar", `${document.getElementById("bar").offsetHeight}px`);
+    document.page.dirty = true; // The card covers another part of the world.
   }
 
   // Renders with changed fields.
@@ -126,7 +125,7 @@ export class TrainingCard {
 
   closed() {
     const { id, state, name, has_rule, iteration = 0, total = Infinity } = this.event, active = ACTIVE.includes(state);
-    if (!active && has_rule && this.showing !== id) return [button(`${name} is learned: watch`, () => this.show())];
+    if (!active && has_rule && this.showing !== id) return [button(`Watch ${name}`, () => this.show())];
     const share = `Learning ${name}: ${Math.floor((100 * iteration) / total)} %`;
     return [button(active ? share : "Grow your own picture", () => this.change({ open: true, choosing: !active }))];
   }
@@ -141,7 +140,7 @@ export class TrainingCard {
       text("Choose or drop a picture or a 3D file. Particles learn it while you watch."),
       row(button("Choose a file", () => this.file.click())),
       row(text("or an emoji"), emoji, button("Grow", typed)),
-      ...(this.event.has_rule ? [row(button(`Show ${this.event.name}`, () => this.show()))] : []),
+      ...(this.event.has_rule ? [row(button(`Watch ${this.event.name}`, () => this.show()))] : []),
     ];
   }
 
@@ -172,11 +171,11 @@ export class TrainingCard {
     });
     const how = state === "done" ? `Learned in ${duration(seconds)}` : `Stopped at iteration ${iteration} of ${total}`;
     const finished = preset === "best" ? " Cut it, wipe a part of it." : " Cuts close; wiped parts may stay grey.";
-    const hint = state === "done" && this.showing === id ? finished : "";
+    const watched = this.showing === id, hint = state === "done" && watched ? finished : "";
     return [
-      this.heading(name), ...this.target(), text(`${how}.${hint}`), this.quality(),
+      this.heading(watched ? name : `Your ${name}`), ...this.target(), text(`${how}.${hint}`), watched ? this.quality() : "",
       row(link("Save rule", "rule.safetensors", ".safetensors"), link("Save page", "page.html", ".html"),
-        this.showing === id ? button("Back", () => this.leave()) : this.watch(),
+        watched ? button("Back", () => this.leave()) : this.watch(),
         button("Another", () => this.change({ choosing: true }))),
       make("p", { className: "path", textContent: `The run is in ${folder}` }),
     ];
@@ -202,11 +201,11 @@ export class TrainingCard {
     return button("Watch", () => this.show());
   }
 
-  // Training loss, and how near the world comes to the picture.
+  // The training's loss, and how near the world comes to the picture.
   quality() {
     const { loss, id } = this.event, parts = [];
-    if (loss !== undefined) parts.push(`training loss ${loss.toPrecision(3)}`);
-    if (this.psnr !== null && this.showing === id) parts.push(`PSNR ${this.psnr.toFixed(1)} dB`);
+    if (loss !== undefined) parts.push(`Loss\u00a0${loss.toPrecision(3)}`);
+    if (this.psnr !== null && this.showing === id) parts.push(`PSNR\u00a0${this.psnr.toFixed(1)}\u00a0dB`);
     return text(parts.join(" · "));
   }
 
