@@ -151,8 +151,7 @@ class ScriptedShepherd(BrushPolicy):
     def act(self) -> Tensor:
         """Return actions that push particles towards each world's goal, shape [B, J, W]."""
         worlds, action = self.worlds, super().act()
-        achieved = self.task.achieved(worlds.particles, worlds.context)
-        missing = (self.task.desired(worlds.context) - achieved)[:, None, :2]
+        missing = (self.task.desired(worlds.context) - worlds.context.achieved)[:, None, :2]
         if self.config.aim == "move":
             direction = missing.expand(-1, len(self._places), -1)
         elif self.config.aim == "reshape":
@@ -223,5 +222,6 @@ class GradientGardener(BrushPolicy):
         for action in plan:
             particles = task.brush_and_roll(particles, action, random)
             loss = sum(task.losses(particles.x, particles.s).values())
-            total = total + task.reward(particles, loss, worlds.context)
+            context = task.measured(particles, worlds.context)
+            total = total + task.reward(particles, loss, context)
         return total

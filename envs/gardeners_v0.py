@@ -1,4 +1,4 @@
-"""Two agents with brushes and opposed aims, as PettingZoo's `parallel_env`, `env` and `raw_env`.
+"""Two agents with brushes and opposed aims: `parallel_env`, `env`, `raw_env` and `batched`.
 
 Importing this module registers `npa/Gardeners-v0` with PettingZoo (1.27 or newer).
 """
@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from npa_envs.envs.core.base import to_output
-from npa_envs.envs.core.vector import checked_count
+from npa_envs.envs.core.vector import NPAVectorEnv, checked_count
 from npa_envs.envs.garden.brush_actions import BrushSpaces
 from npa_envs.envs.gardener2d import Gardener2DEnv, GardenerTask
 from npa_envs.envs.multi.agents_env import state_space
@@ -41,6 +41,10 @@ class _SharedGarden(Gardener2DEnv):
     task_type = _SharedTask
 
 
+CALM = {"gust_chance": 0.0, "blight_chance": 0.0}
+"""Defaults of gardens with a raider."""
+
+
 class GardenersEnv(KnownAgents):
     """Two gardeners at one picture: the keeper keeps it intact, the raider spoils it.
 
@@ -57,6 +61,9 @@ class GardenersEnv(KnownAgents):
 
     `garden` is the world as a Gymnasium environment. Policies of `npa_envs.agents.garden_policies`
     take it, and their actions fit either agent: `ScriptedGardener(env.garden)`.
+
+    `gardeners_v0.batched(world_count=B)` steps B worlds together: observations [B, O], actions
+    [B, J W], rewards and flags [B], by agent.
 
     ## Spaces, starting state and info
 
@@ -97,8 +104,7 @@ class GardenersEnv(KnownAgents):
     def __init__(self, max_cycles: int = 32, **config: Any) -> None:
         self.max_cycles = checked_count("max_cycles", max_cycles)
         """Steps of an episode."""
-        calm = {"gust_chance": 0.0, "blight_chance": 0.0}
-        self.garden = _SharedGarden(**(calm | config | {"episode_steps": self.max_cycles}))
+        self.garden = _SharedGarden(**(CALM | config | {"episode_steps": self.max_cycles}))
         """The world as a Gymnasium environment, whose actions are dicts with both agents'."""
         self.render_mode, self.possible_agents = self.garden.render_mode, list(AGENTS)
         self.agents: list[str] = []
@@ -144,10 +150,7 @@ class GardenersEnv(KnownAgents):
 
     def state(self) -> Any:
         """Return the whole world, for central critics: a row [position; state; 1] a particle."""
-        self.garden.check_begun("state needs a world")
-        x, s = self.garden.particles()
-        state = torch.cat((x, s, torch.ones_like(x[:, :1])), dim=1)
-        return to_output(state, self.garden.config.output)
+        return _state(self.garden)
 
     def render(self) -> Any:
         """Return the world's picture, uint8, [R, R, 3]; None unless `render_mode="rgb_array"`."""
@@ -156,6 +159,48 @@ class GardenersEnv(KnownAgents):
     def close(self) -> None:
         """End the world, and close the window, if there is one."""
         self.garden.close()
+
+
+class GardenersVectorEnv(NPAVectorEnv):
+    """B worlds of `GardenersEnv`, stepped together, by an `NPAVectorEnv` with two agents.
+
+    World k, reset with `seed`, is that with `seed + k` by itself. Each agent has observations
+    [B, O], actions [B, J W], rewards and flags [B], and the infos of `npa/Gardener2D-v0`.
+    """
+
+    task_type = _SharedTask
+    possible_agents = AGENTS
+
+    def __init__(self, max_cycles: int = 32, *, world_count: int = 1, **config: Any) -> None:
+        count = checked_count("world_count", world_count)
+        steps = {"episode_steps": checked_count("max_cycles", max_cycles)}
+        super().__init__(count, max_episode_steps=max_cycles, **(CALM | config | steps))
+        self.single_observation_spaces = dict.fromkeys(AGENTS, self.single_observation_space)
+        self.single_action_spaces = dict.fromkeys(AGENTS, self.single_action_space)
+
+    def reset(self, **options: Any) -> tuple[Any, dict[str, Any]]:
+        """Start episodes as `NPAVectorEnv.reset` does; return both agents' observations, infos."""
+        observation, infos = super().reset(**options)
+        return _for_both(observation), {agent: dict(infos) for agent in AGENTS}
+
+    def step(self, actions: Mapping[str, Any]) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
+        """Apply both agents' actions; return what PettingZoo's `step` does, of all worlds."""
+        if not isinstance(actions, Mapping) or set(actions) != set(AGENTS):
+            raise NPAError(f"actions must be given for the agents {AGENTS}, got {shown(actions)}")
+        observation, reward, *ends, infos = super().step(actions)
+        ended, cut = (dict.fromkeys(AGENTS, end) for end in ends)
+        rewards = {AGENTS[0]: reward, AGENTS[1]: -reward}
+        return _for_both(observation), rewards, ended, cut, {a: dict(infos) for a in AGENTS}
+
+    def state(self) -> Any:
+        """Return the worlds as `GardenersEnv.state` does, [B, N, 2 + C + 1]."""
+        return _state(self)
+
+
+def _state(garden: Any) -> Any:
+    garden.check_begun("state needs a world")
+    x, s = garden.particles()
+    return to_output(torch.cat((x, s, torch.ones_like(x[..., :1])), dim=-1), garden.config.output)
 
 
 def _for_both(observation: Any) -> dict[str, Any]:
@@ -177,6 +222,7 @@ def parallel_env(max_cycles: int = 32, **config: Any) -> GardenersEnv:
     return GardenersEnv(max_cycles, **config)
 
 
+batched = GardenersVectorEnv
 raw_env, env = in_turns(parallel_env)
 
 

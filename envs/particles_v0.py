@@ -1,4 +1,4 @@
-"""Particles as agents, as PettingZoo's functions: `parallel_env`, `env` and `raw_env`.
+"""Particles as agents, as PettingZoo's functions: `parallel_env`, `env`, `raw_env` and `batched`.
 
 Importing this module registers the ids of `ENVIRONMENTS` with PettingZoo (1.27 or newer).
 """
@@ -10,6 +10,7 @@ from typing import Any
 from npa_envs.envs.core.config import as_python
 from npa_envs.envs.multi.parallel import CrowdEnv, in_turns, register
 from npa_envs.envs.multi.shipped_tasks import task_type
+from npa_envs.envs.multi.vector import MultiSpeciesVectorEnv
 from npa_envs.envs.multispecies_v0 import settings
 from npa_envs.errors import NPAError
 from npa_envs.registration import SPECIES, SPECIES_SIZES
@@ -96,19 +97,23 @@ class ParticlesEnv(CrowdEnv):
     ## Arguments
 
     Those of [several species](MultiSpecies.md#arguments), of `npa_envs.envs.particles_v0` instead;
-    `particle_count` is 64 by default and 512 at most.
+    `particle_count` is 64 by default and 512 at most. `particles_v0.batched(..., world_count=B)`
+    steps B worlds together: a particle's observations are [B, P], its actions [B, A].
     """
 
     metadata: Any = CrowdEnv.metadata | {"name": "npa_particles_v0"}
 
     def __init__(self, task: str = "mixing", **config: Any) -> None:
-        count = sum(task_type(task).config_type.from_keywords(config).counts)
-        if count > MAX_CROWD:
-            raise NPAError(
-                f"particle_count must be at most {MAX_CROWD} where every particle is an agent, "
-                f"got {count}: make species the agents with npa_envs.envs.multispecies_v0"
-            )
         super().__init__(task, config, by_particle=True)
+
+
+class ParticlesVectorEnv(MultiSpeciesVectorEnv):
+    """Worlds of `ParticlesEnv`, stepped together: `MultiSpeciesVectorEnv` with other agents.
+
+    Observations of an agent have shape [B, P], actions [B, A], rewards and flags [B].
+    """
+
+    _of_particles = True
 
 
 def parallel_env(
@@ -118,10 +123,38 @@ def parallel_env(
 
     Arguments are those of `multispecies_v0.parallel_env`.
     """
+    return ParticlesEnv(**_settings(task, species_count, config))
+
+
+def batched(
+    task: str = "mixing",
+    species_count: int | None = None,
+    *,
+    world_count: int = 1,
+    autoreset_mode: str = "same-step",
+    **config: Any,
+) -> ParticlesVectorEnv:
+    """Return many worlds, stepped together; world k is `parallel_env` by itself.
+
+    Arguments are those of `multispecies_v0.batched`.
+    """
+    keywords = _settings(task, species_count, config)
+    return ParticlesVectorEnv(world_count=world_count, autoreset_mode=autoreset_mode, **keywords)
+
+
+def _settings(task: str, species_count: int | None, config: dict[str, Any]) -> dict[str, Any]:
+    """Return keywords as `multispecies_v0.settings`, with few particles."""
     keywords = settings(task, species_count, config)
     if not as_python(keywords.get("particle_counts")):
         keywords.setdefault("particle_count", PARTICLE_COUNT)
-    return ParticlesEnv(**keywords)
+    fields = {name: value for name, value in keywords.items() if name != "task"}
+    count = sum(task_type(keywords["task"]).config_type.from_keywords(fields).counts)
+    if count > MAX_CROWD:
+        raise NPAError(
+            f"particle_count must be at most {MAX_CROWD} where every particle is an agent, "
+            f"got {count}: make species the agents with npa_envs.envs.multispecies_v0"
+        )
+    return keywords
 
 
 raw_env, env = in_turns(parallel_env)

@@ -89,8 +89,7 @@ class PointClassificationTask(TargetEnvTask[PointClassificationEnvConfig]):
     def _make_task(self) -> PointClassification:
         config, device = self.config, self.device
         task = PointClassification(config.task_config, device=device, split=config.split)
-        # Reads the data now, as imports by their readers draw from Python's random generator.
-        _ = task.clouds.coverage
+        _ = task.clouds  # Reads the data now: errors come from gym.make.
         if not config.rule:
             return task
         loaded = load_readout_rule("rule", config.rule, config.state_dim, device)

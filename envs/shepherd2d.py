@@ -96,6 +96,8 @@ class ShepherdEpisode(NamedTuple):
     """First two values of the desired goal, shape [B, 2]."""
     moments: Tensor
     """The creature's `moments_of` at the start, shape [B, 5]."""
+    achieved: Tensor
+    """Goals that the current particles achieve, shape [B, 3]."""
 
 
 class ShepherdTask(GardenTask[Shepherd2DEnvConfig]):
@@ -117,7 +119,12 @@ class ShepherdTask(GardenTask[Shepherd2DEnvConfig]):
         else:
             goal = 1.0 + drawn
         intact = super().episode_context(start, loss, random)
-        return ShepherdEpisode(intact.intact_loss, intact.rise, goal, moments)
+        achieved = goal.new_zeros(len(goal), 3)
+        return ShepherdEpisode(intact.intact_loss, intact.rise, goal, moments, achieved)
+
+    def measured(self, particles: Particles, context: ShepherdEpisode) -> ShepherdEpisode:
+        """Return the context with the goals that `particles` achieve."""
+        return context._replace(achieved=self.achieved(particles, context))
 
     def achieved(self, particles: Particles, context: ShepherdEpisode) -> Tensor:
         """Return achieved goals, [B, 3]: two values by `aim`, and lost fractions (0: intact)."""
@@ -151,21 +158,20 @@ class ShepherdTask(GardenTask[Shepherd2DEnvConfig]):
         return nearness - self.config.reward_weight * excess.clamp(min=0.0)
 
     def reward(self, particles: Particles, loss: Tensor, context: ShepherdEpisode) -> Tensor:
-        """Return the rewards of a step, [B], for the goals that `particles` achieve after it."""
-        achieved = self.achieved(particles, context)
-        return self.goal_reward(achieved, self.desired(context)).to(torch.float32)
+        """Return the rewards of a step, [B], for the achieved goals of `context`."""
+        return self.goal_reward(context.achieved, self.desired(context)).to(torch.float32)
 
     def context_info(self, particles: Particles, context: ShepherdEpisode) -> dict[str, Tensor]:
         """Return `is_success`, `distance` to the goal and `lost` fraction, [B] each."""
-        achieved, desired = self.achieved(particles, context), self.desired(context)
+        achieved, desired = context.achieved, self.desired(context)
         distance = (achieved - desired)[:, :2].square().sum(dim=1).sqrt()
         success = (distance <= self.config.tolerance) & (achieved[:, 2] <= desired[:, 2])
-        return {"is_success": success, "distance": distance, "lost": achieved[:, 2]}
+        return {"is_success": success, "distance": distance, "lost": achieved[:, 2].clone()}
 
     def observe(self, particles: Particles, loss: Tensor, context: ShepherdEpisode) -> Tensor:
         """Return the observation, then the achieved and the desired goal, [B, O + 6]."""
         observed = super().observe(particles, loss, context)
-        goals = torch.cat((self.achieved(particles, context), self.desired(context)), dim=1)
+        goals = torch.cat((context.achieved, self.desired(context)), dim=1)
         return torch.cat((observed, goals.clamp(-OBSERVATION_LIMIT, OBSERVATION_LIMIT)), dim=1)
 
 
@@ -258,7 +264,8 @@ class Shepherd2DEnv(_GoalReward, GardenEnv):
     | `"sparse"` | 0 where d is at most `tolerance` and the creature is intact, else −1 |
 
     Both reward each step. `env.unwrapped.compute_reward(achieved_goal, desired_goal, info)`
-    returns the same, for one goal or many.
+    returns the same, for one goal or many. `HerReplayBuffer` finds it in `gym.make(id)`;
+    Stable-Baselines3's `check_env` needs `env.unwrapped`.
 
     ## Starting state
 

@@ -232,6 +232,7 @@ class RuleDrivenWorlds(BatchedWorlds):
     @makes_plain_tensors
     def perceive(self, out: Tensor | None = None) -> Tensor:
         """Return all worlds' current observations, shape [B, O], in `out` if it is given."""
+        self._measure()
         observed = self.task.observe(self.particles, self.loss, self.context)
         return observed if out is None else out.copy_(observed)
 
@@ -249,6 +250,7 @@ class RuleDrivenWorlds(BatchedWorlds):
     def write_rewards(self, terms: Tensor) -> None:
         """Write endings for new losses, [terms, B], the task's rewards, and the next goals."""
         self.episodes.update(terms)
+        self._measure()
         # Replaces the decrease of the loss, which the update gives as the reward.
         rewards = self.task.reward(self.particles, self.loss, self.context)
         report = self.episodes.report
@@ -257,6 +259,13 @@ class RuleDrivenWorlds(BatchedWorlds):
             rewards = torch.where(terminated | truncated, rewards, 0.0)
         report.named.reward.copy_(rewards)
         self.task.next_goals(self.episodes.elapsed, self.context, self.goal)
+
+    def _measure(self) -> None:
+        """Write what the task measures of the current particles into `context`."""
+        measured = self.task.measured(self.particles, self.context)
+        for stored, value in zip(self.context, measured, strict=True):
+            if value is not stored:
+                stored.copy_(value)
 
     def extra_info(self) -> dict[str, Tensor]:
         """Return the task's own entries of infos (`context_info`): values [B, ...] by name."""
@@ -285,6 +294,10 @@ class RuleDrivenTask(PictureEnvTask[AnyPicture]):
     def episode_context(self, start: Start, loss: Tensor, random: WorldRandom) -> Any:
         """Return the `context` of B episodes that start; `loss`, [B], is the loss of `start`."""
         raise NotImplementedError
+
+    def measured(self, particles: Particles, context: Any) -> Any:
+        """Return the context with what is measured of `particles`, once for all that reads it."""
+        return context
 
     def reward(self, particles: Particles, loss: Tensor, context: Any) -> Tensor:
         """Return the rewards of a step, [B]; `particles` and `loss`, [B], are after it."""

@@ -27,7 +27,8 @@ given = parser.parse_args()
 torch.set_num_threads(1)  # small worlds; a busy machine does not slow them down
 name = given.env
 env = gym.make(name, render_mode="rgb_array")
-test_envs = gym.make_vec(name, num_envs=16)
+count = min(16, 2 + given.steps // 2000)  # held-out episodes
+test_envs = gym.make_vec(name, num_envs=count)
 test_envs.action_space.seed(0)
 piece = min(2048, given.steps)  # steps before PPO learns from them
 network = "MultiInputPolicy" if isinstance(env.observation_space, gym.spaces.Dict) else "MlpPolicy"
@@ -39,15 +40,26 @@ def policy(observations):
 
 
 def evaluation(policy):
-    episodes = evaluate_policy(test_envs, policy, seeds=range(100, 116))
+    episodes = evaluate_policy(test_envs, policy, seeds=range(100, 100 + count))
     return episodes.mean_return, episodes.standard_error
 
 
-curve = [(0, *evaluation(policy))]
-while model.num_timesteps < given.steps:
-    model.learn(2 * piece, reset_num_timesteps=False)
+def note():
     curve.append((model.num_timesteps, *evaluation(policy)))
-    print(f"{curve[-1][0]} steps: {curve[-1][1]:.2f}", flush=True)
+    print(f"{curve[-1][0]} steps: return {curve[-1][1]:.2f}", flush=True)
+
+
+def tell(*_):
+    if model.num_timesteps % 512 == 0:
+        print(f"{model.num_timesteps} steps", flush=True)
+    return True
+
+
+curve = []
+note()
+while model.num_timesteps < given.steps:
+    model.learn(2 * piece, callback=tell, reset_num_timesteps=False)
+    note()
 
 results = {
     "learned": curve[-1][1:],

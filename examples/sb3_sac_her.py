@@ -27,7 +27,8 @@ given = parser.parse_args()
 torch.set_num_threads(1)  # small worlds; a busy machine does not slow them down
 name = "npa/Shepherd2DSmall-v0"
 env = gym.make(name, reward="sparse")
-test_envs = gym.make_vec(name, num_envs=32, reward="sparse")
+count = min(32, 2 + given.steps // 500)  # held-out episodes
+test_envs = gym.make_vec(name, num_envs=count, reward="sparse")
 test_envs.action_space.seed(0)
 model = SAC(
     "MultiInputPolicy",
@@ -45,15 +46,26 @@ def policy(observations):
 
 
 def evaluation(policy):
-    episodes = evaluate_policy(test_envs, policy, seeds=range(100, 132))
+    episodes = evaluate_policy(test_envs, policy, seeds=range(100, 100 + count))
     return episodes.mean_return, episodes.standard_error
 
 
-curve = [(0, *evaluation(policy))]
-while model.num_timesteps < given.steps:
-    model.learn(min(3_000, given.steps), reset_num_timesteps=False)
+def note():
     curve.append((model.num_timesteps, *evaluation(policy)))
-    print(f"{curve[-1][0]} steps: {curve[-1][1]:.2f}", flush=True)
+    print(f"{curve[-1][0]} steps: return {curve[-1][1]:.2f}", flush=True)
+
+
+def tell(*_):
+    if model.num_timesteps % 500 == 0:
+        print(f"{model.num_timesteps} steps", flush=True)
+    return True
+
+
+curve = []
+note()
+while model.num_timesteps < given.steps:
+    model.learn(min(3_000, given.steps), callback=tell, reset_num_timesteps=False)
+    note()
 
 results = {
     "learned": curve[-1][1:],

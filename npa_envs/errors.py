@@ -91,6 +91,8 @@ def shown(value: object) -> str:
 
     The time is limited too, for deeply nested values, long numbers and whole files.
     """
+    if type(value) is str and value.isalnum() and len(value) <= KNOWN_LENGTH:
+        return repr(value)  # checks that pass call this too, in each step
     try:
         brief = str(value) if isinstance(value, BaseException) else _brief.repr(value)
     except Exception:

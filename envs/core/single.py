@@ -59,7 +59,8 @@ class NPAEnv(WorldsEnv, gymnasium.Env[Any, Any]):
 
     A particle has left the world if a coordinate is beyond ±`position_limit`. Its state has
     diverged if a channel is beyond ±`observation_limit`. `max_episode_steps` of `gym.make` gives no
-    reason, and `reward="sparse"` needs its number as `episode_steps` as well.
+    reason, and `reward="sparse"` needs its number as `episode_steps` as well. After `close` only a
+    `reset` is no error: it begins anew.
 
     ## Info
 

@@ -61,6 +61,8 @@ class MultiSpeciesVectorEnv(AgentsEnv):
     """
 
     _is_batch = True
+    _of_particles = False
+    """Whether agents are particles, with observations [B, P] and actions [B, A]."""
 
     def __init__(
         self,
@@ -78,7 +80,7 @@ class MultiSpeciesVectorEnv(AgentsEnv):
                 "autoreset_mode must be 'same-step' or 'disabled' where several species share a "
                 "world, got 'next-step': one of these"
             )
-        super().__init__(task, config, self.world_count, by_particle=False)
+        super().__init__(task, config, self.world_count, by_particle=self._of_particles)
         self.agents = self.possible_agents
         """All agents, as every species always has arrays."""
 
@@ -119,6 +121,9 @@ class MultiSpeciesVectorEnv(AgentsEnv):
         shapes = [(self.world_count, *space.shape) for space in self.single_action_spaces.values()]
         with worlds.device_context():
             action = joined_actions(actions, self.possible_agents, shapes, worlds.device)
+            if self._of_particles:
+                # Joined agent by agent.
+                action = action.view(-1, self.world_count, action.shape[-1]).transpose(0, 1)
             opponents = worlds.particle_count - action.shape[1]
             outcome = worlds.step(F.pad(action, (0, 0, 0, opponents)) if opponents else action)
             observation, final = outcome.observation, None
@@ -171,8 +176,9 @@ class MultiSpeciesVectorEnv(AgentsEnv):
 
     def _rows(self, observation: Tensor) -> ByAgent:
         """Return each agent's observations, [B, N_k, P], from all particles' perception."""
-        rows, spans = self._out(observation), self.worlds.spans
-        return {agent: rows[:, spans[k]] for k, agent in enumerate(self.possible_agents)}
+        rows = self._out(observation)
+        places = range(rows.shape[1]) if self._of_particles else self.worlds.spans
+        return {a: rows[:, k] for a, k in zip(self.possible_agents, places, strict=False)}
 
     def _columns(self, values: Any) -> ByAgent:
         """Return each agent's column, [B], of `values`, [B, M]."""

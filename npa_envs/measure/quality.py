@@ -312,7 +312,7 @@ def accuracies(
     that of the update masks. `progress` is called with the steps done since its last call.
     """
     check_steps("checkpoints", checkpoints)
-    runner = _copied_runner(rule, task, task.clouds.x.device, seed, progress)
+    runner = _copied_runner(rule, task, task.clouds.label.device, seed, progress)
 
     def measured(index: Tensor) -> Iterator[tuple[Tensor, ...]]:
         label, clouds = task.clouds.label[index], _zero_clouds(runner, index)
@@ -350,7 +350,7 @@ def changes_of_mind(
     """
     check_steps("settle_steps", [settle_steps])
     check_steps("steps", steps, at_least=0)
-    runner = _copied_runner(rule, task, task.clouds.x.device, seed, progress)
+    runner = _copied_runner(rule, task, task.clouds.label.device, seed, progress)
     classes, partner = task.clouds.label, _partners(task.clouds.label)
 
     def measured(index: Tensor) -> Iterator[tuple[Tensor, ...]]:
@@ -404,7 +404,7 @@ def hidden_states(
 
 
 def _zero_clouds(runner: RuleRunner, index: Tensor) -> Particles:
-    x = runner.task.clouds.x[index].to(next(runner.rule.parameters()).dtype)
+    x = runner.task.clouds.points(index).to(next(runner.rule.parameters()).dtype)
     return Particles(x, x.new_zeros(*x.shape[:2], runner.task.config.state_dim))
 
 
@@ -414,7 +414,7 @@ def _cloud_means(
     """Return rows of means over all clouds; `measured` maps indices [B] to rows of cells [B]."""
     count = len(task.clouds.label)
     sums = torch.zeros((), dtype=torch.float64)
-    for index in torch.split(torch.arange(count, device=task.clouds.x.device), CLOUD_BATCH):
+    for index in torch.split(torch.arange(count, device=task.clouds.label.device), CLOUD_BATCH):
         rows = [[values.double().sum() for values in row] for row in measured(index)]
         sums = sums + torch.stack([torch.stack(row) for row in rows]).cpu()
     means: list[list[float]] = (sums / count).tolist()

@@ -124,7 +124,7 @@ class PointClassification(ParticleTask[PointClassificationConfig]):
 
     @cached_property
     def clouds(self) -> PointClouds:
-        """All clouds of the split, loaded at the first use."""
+        """All clouds of the split, whose pictures are loaded at the first use."""
         config = self.config
         clouds = load_clouds(
             config.data,
@@ -176,7 +176,7 @@ class PointClassification(ParticleTask[PointClassificationConfig]):
         config, clouds = self.config, self.clouds
         chosen = drawn_indices(len(clouds.label), world_count, generator, torch.device(device))
         chosen = chosen.to(clouds.label.device)
-        x, goal = clouds.x[chosen].to(device), clouds.label[chosen].to(device)
+        x, goal = clouds.points(chosen).to(device), clouds.label[chosen].to(device)
         if self.split == "train":
             x = augmented(x, config.rotation, config.stretch, config.jitter, generator)
         return Particles(x, x.new_zeros(*x.shape[:2], config.state_dim), goal=goal)

@@ -161,8 +161,9 @@ def page_rule(source: str, *, particle_count: int | None = None) -> dict[str, An
         clouds = cast(PointClassification, task).clouds
         label = clouds.label.tolist()
         # One cloud of each class, the first.
-        chosen = [clouds.x[label.index(kind)] for kind in sorted(set(label))]
-        seed = {"kind": "clouds", "clouds": [_packed(cloud) for cloud in chosen]}
+        chosen = torch.tensor([label.index(kind) for kind in sorted(set(label))])
+        packed = [_packed(cloud) for cloud in clouds.points(chosen)]
+        seed = {"kind": "clouds", "clouds": packed}
     elif task.box is not None:
         seed = {"kind": "box"}
     elif hasattr(task.config, "seed_radius"):

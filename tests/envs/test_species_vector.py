@@ -6,7 +6,7 @@ import torch
 from support.crowds import TASKS, drawn, make, small
 from support.refusals import refused
 
-from npa_envs.envs import multispecies_v0
+from npa_envs.envs import gardeners_v0, multispecies_v0, particles_v0
 from npa_envs.envs.core import world_state
 from npa_envs.envs.multi import AGENT_REASONS
 from npa_envs.errors import NPAError
@@ -123,3 +123,52 @@ def test_a_first_reset_that_is_refused_leaves_the_next_one_random():
         states += list(envs.state())
     # Neither two worlds nor two environments are alike.
     assert len({state.tobytes() for state in states}) == 6
+
+
+GARDEN = {"max_cycles": 3, "particle_count": 64, "grow_steps": 8, "rule_steps": 2}
+
+
+@pytest.mark.parametrize(
+    ("module", "keywords"),
+    [
+        (particles_v0, {"task": "npa/SegregationSmall-v0", "max_cycles": 5}),
+        # Particles leave the world one by one, and opponents are no agents.
+        (particles_v0, {"task": "npa/InvasionSmall-v0", "position_limit": 0.62, "max_cycles": 8}),
+        (gardeners_v0, GARDEN),
+    ],
+)
+def test_worlds_of_particles_or_gardeners_equal_single_ones(module, keywords):
+    envs = module.batched(world_count=3, **keywords)
+    singles = [module.parallel_env(**keywords) for _ in range(3)]
+    observations, _ = envs.reset(seed=7)
+    for k, env in enumerate(singles):
+        seen, _ = env.reset(seed=7 + k)
+        assert list(seen) == list(envs.possible_agents)
+        assert all(np.array_equal(observations[agent][k], seen[agent]) for agent in seen)
+    generator, early = np.random.default_rng(1), 0
+    for _ in range(17):
+        actions = {
+            agent: generator.uniform(-1, 1, (3, *space.shape)).astype(np.float32)
+            for agent, space in singles[0].action_spaces.items()
+        }
+        observations, rewards, terminations, truncations, infos = envs.step(actions)
+        for k, env in enumerate(singles):
+            seen, paid, ended, cut, info = env.step({a: actions[a][k] for a in env.agents})
+            early += sum(ended.values())
+            for agent in paid:
+                assert rewards[agent][k] == np.float32(paid[agent])
+                assert (terminations[agent][k], truncations[agent][k]) == (ended[agent], cut[agent])
+                if env.agents:
+                    assert infos[agent]["loss"][k] == pytest.approx(info[agent]["loss"], rel=1e-6)
+            seen = seen if env.agents else env.reset()[0]
+            for agent in env.agents:
+                assert np.array_equal(observations[agent][k], seen[agent])
+            assert np.array_equal(envs.state()[k], env.state())
+    assert (early > 0) == ("position_limit" in keywords)
+
+
+def test_gardeners_together_need_both_actions():
+    envs = gardeners_v0.batched(world_count=2, **GARDEN)
+    envs.reset(seed=0)
+    with pytest.raises(NPAError, match="actions must be given for the agents"):
+        envs.step({"keeper_0": np.zeros((2, *envs.single_action_space.shape), np.float32)})

@@ -288,13 +288,6 @@ PROGRAMS = {
         slice(2, None),
         "stable_baselines3",
     ),
-    "learning: PPO": Program(
-        ("labels == ['ppo'] * 3 + ['ppo_world'] * 3",),
-        (("500_000", "1_000"),),
-        slice(1, 2),
-        "stable_baselines3",
-    ),
-    "training": Program(("printed.startswith('random: ')",)),
     "textures": Program(("printed.count('tensor([') == 2",)),
     "point_classification": Program(
         ("'AccuracyRow(step=8' in printed", "points.shape == (1, 128, 2)")
@@ -472,7 +465,7 @@ def test_the_code_about_learning_runs(folder, monkeypatch, capsys):
     # Its search pays for episodes too, and ends early here.
     assert scripted > random
     assert (folder / "grown" / "rule-0.safetensors").exists()
-    (folder / "mine.py").write_text(code_blocks("learning")[2], encoding="utf-8")
+    (folder / "mine.py").write_text(code_blocks("learning")[1], encoding="utf-8")
     monkeypatch.syspath_prepend(folder)
     budget = Budget(particle_steps=2000)
     trained = train("mine:train", names["problem"], budget, 0, noise=0.2, curve_points=1)

@@ -127,7 +127,7 @@ def wrapper(module, name):
     ("library", "hint", "call"),
     [
         ("cma", EXTRA.format("evolution"), lambda _: train("evolution", heart(), ONE_STEP, 0)),
-        ("sklearn.datasets", EXTRA.format("points"), lambda _: load_pictures("digits")),
+        ("sklearn", EXTRA.format("points"), lambda _: load_pictures("digits")),
         ("trimesh", EXTRA.format("meshes"), load_mesh),
         ("torchrl.data", EXTRA.format("torchrl"), lambda _: wrapper("torchrl", "NPATorchRLEnv")),
         ("rsl_rl.env", EXTRA.format("rslrl"), lambda _: wrapper("rsl_rl", "RslRlParticleEnv")),

@@ -7,13 +7,19 @@ from support.small_digits import COUNTS, idx, pictures, write_idx
 
 from npa_envs.errors import NPAError
 from npa_envs.tasks.targets.digit_clouds import (
+    PointClouds,
+    _farthest_one_by_one,
     _farthest_points,
     augmented,
     load_clouds,
     load_pictures,
     read_idx,
-    sample_ink,
 )
+
+
+def clouds_of(ink, particle_count, **options):
+    """Return the clouds of pictures that have no classes."""
+    return PointClouds(ink, np.zeros(len(ink), np.int64), particle_count, **options)
 
 
 def write_training_files(folder, images, labels):
@@ -82,11 +88,13 @@ def test_the_built_in_digits_are_split_fairly_and_without_overlap():
     assert not {picture.tobytes() for picture in train} & {picture.tobytes() for picture in test}
 
 
-def test_each_point_is_as_far_as_can_be_from_those_before():
+@pytest.mark.parametrize("choose", [_farthest_points, _farthest_one_by_one])
+def test_each_point_is_as_far_as_can_be_from_those_before(choose):
     random = torch.Generator().manual_seed(0)
     candidates = torch.randint(2048, (3, 60, 2), generator=random).float()
     counts = torch.tensor([60, 31, 5])
-    chosen = _farthest_points(candidates, counts, 9).double()
+    chosen = choose(candidates, counts, 9).double()
+    assert torch.equal(chosen, _farthest_points(candidates, counts, 9))
     for cloud, points, count in zip(chosen, candidates.double(), counts.tolist(), strict=True):
         assert torch.equal(cloud[0], points[0])
         for k in range(1, min(9, count)):
@@ -100,7 +108,8 @@ def test_points_lie_on_the_ink_and_the_first_row_is_the_highest():
     ink = np.zeros((2, 8, 4), np.float32)
     ink[0, :2, 3] = 0.7
     ink[1, 6:, :] = 0.2
-    x, coverage = sample_ink(ink, 40)
+    clouds = clouds_of(ink, 40)
+    x = clouds.x
     # Enlarged bilinearly, ink ends within a quarter of a pixel of the pixels' edges.
     assert x[0, :, 0].min() > (3 - 0.26) / 8
     assert x[0, :, 0].max() < 4 / 8
@@ -108,9 +117,9 @@ def test_points_lie_on_the_ink_and_the_first_row_is_the_highest():
     assert x[1, :, 1].max() < (2 + 0.26) / 8
     assert x[1, :, 0].max() < 0.5
     # Shares of the picture: 2 of 32 pixels and 8 of 32, measured 0.154.
-    assert coverage == pytest.approx((2 / 32 + 8 / 32) / 2, abs=0.02)
+    assert 2.0 * clouds.coverage == pytest.approx((2 / 32 + 8 / 32) / 2, abs=0.02)
     with pytest.raises(NPAError, match="empty one at 1"):
-        sample_ink(np.stack([ink[0], 0 * ink[0]]), 10)
+        clouds_of(np.stack([ink[0], 0 * ink[0]]), 10)
 
 
 @pytest.mark.parametrize("shape", [(12, 12), (3, 12), (12, 6)])
@@ -118,19 +127,29 @@ def test_coverage_is_the_fraction_of_the_unit_square(folder, tmp_path, shape):
     write_training_files(tmp_path, np.full((2, *shape), 255, np.uint8), np.zeros(2, np.uint8))
     clouds = load_clouds(str(tmp_path), "train", 20, device=torch.device("cpu"))
     assert clouds.coverage == shape[0] * shape[1] / max(shape) ** 2
-    # In a square picture it is the fraction of the picture, to the last bit.
-    clouds = load_clouds(str(folder), "train", 20, device=torch.device("cpu"))
-    assert clouds.coverage == sample_ink(load_pictures(str(folder))[0], 20)[1] < 1.0
+    assert load_clouds(str(folder), "train", 20, device=torch.device("cpu")).coverage < 1.0
 
 
 def test_a_cloud_does_not_depend_on_the_others_nor_on_the_device(device, monkeypatch):
     images = np.concatenate([pictures(6, 3)[0], pictures(6, 4)[0] // 2]).astype(np.float32)
-    x, _ = sample_ink(images, 100, sample_seed=5)
+    x = clouds_of(images, 100, sample_seed=5).x
     for k in (0, 1, 11):
-        assert torch.equal(sample_ink(images[k : k + 1], 100, sample_seed=5)[0][0], x[k])
+        assert torch.equal(clouds_of(images[k : k + 1], 100, sample_seed=5).x[0], x[k])
     monkeypatch.setattr("npa_envs.tasks.targets.digit_clouds.BATCH_SIZES", {"cpu": 5, "cuda": 5})
-    assert torch.equal(sample_ink(images, 100, sample_seed=5, device=device)[0].cpu(), x)
-    assert not torch.equal(sample_ink(images, 100, sample_seed=6)[0], x)
+    clouds = clouds_of(images, 100, sample_seed=5, device=device)
+    # Those that are asked for first, and again, are the same as all at once.
+    some = torch.tensor([3, 7, 3], device=device)
+    assert torch.equal(clouds.points(some).cpu(), x[[3, 7, 3]])
+    assert torch.equal(clouds.x.cpu(), x)
+    assert not torch.equal(clouds_of(images, 100, sample_seed=6).x, x)
+
+
+def test_clouds_first_chosen_in_inference_mode_are_plain_tensors(folder):
+    with torch.inference_mode():
+        clouds = load_clouds(str(folder), "test", 30, device=torch.device("cpu"))
+        first = clouds.points(torch.tensor([0]))
+    assert torch.equal(clouds.x[:1], first)
+    assert not clouds.x.is_inference()
 
 
 def test_turned_clouds_keep_their_distances_and_their_middle():

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import functools
 import gzip
+import importlib.util
 import math
 import os
 import zlib
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 import torch
@@ -19,6 +19,7 @@ from torch import Tensor
 from npa_envs.atomic_files import home_path, open_regular
 from npa_envs.errors import MissingDependencyError, NPAError, shown, suggest
 from npa_envs.tasks.targets.notes import tell
+from npa_envs.world.cuda_graph import makes_plain_tensors
 from npa_envs.world.randomness import Randomness, normal_draws, uniform_draws
 
 Split = Literal["train", "test"]
@@ -49,21 +50,99 @@ CACHED_DATA_SETS = 4
 """Maximum number of results of `load_clouds` that stay in memory."""
 
 
-@dataclass(frozen=True)
 class PointClouds:
-    """Point clouds with their classes."""
+    """Points with ink in each of M pictures, and the pictures' classes.
 
-    x: Tensor
-    """Positions in [0, 1]² [length units], shape [M, N, 2]; y is up."""
-    label: Tensor
-    """Classes, int64, shape [M]."""
-    coverage: float
-    """Fraction of the unit square that has ink, averaged over the clouds."""
-    summary: str = ""
-    """What was read, in one line; empty for a built-in target."""
+    Points are farthest-point samples of candidates: one random position in each cell of a grid,
+    where the picture, enlarged bilinearly, has ink. The grid is refined until there are enough.
+    Points are the same on every device. On a CPU those of a picture are chosen when they are first
+    asked for. `ink` has shape [M, H, W], `label` [M].
+    """
+
+    def __init__(
+        self,
+        ink: NDArray[np.float32],
+        label: NDArray[np.int64],
+        particle_count: int,
+        *,
+        sample_seed: int = 0,
+        device: str | torch.device = "cpu",
+    ) -> None:
+        darkest = ink.max((1, 2))
+        if (darkest <= 0).any():
+            number = int(np.argmin(darkest))
+            raise NPAError(f"every picture must have ink, got an empty one at {number}: remove it")
+        self.label = torch.from_numpy(label).to(device)
+        """Classes, int64, shape [M]."""
+        least, self._most = (factor * particle_count for factor in CANDIDATE_FACTORS)
+        self._relative = torch.from_numpy(ink / darkest[:, None, None])
+        self._x = torch.empty(len(ink), particle_count, 2, device=device)
+        self._is_missing = torch.ones(len(ink), dtype=torch.bool)
+        self._side = torch.zeros(len(ink), dtype=torch.int64)
+        self._grids: dict[int, tuple[Tensor, Tensor]] = {}
+        areas = torch.empty(len(ink))
+        random = torch.Generator().manual_seed(sample_seed)
+        waiting = torch.arange(len(ink))
+        side = 1 << math.ceil(math.log2(2.0 * math.sqrt(least)))
+        while len(waiting) > 0:
+            self._grids[side] = _grid_points(side, ink.shape[1:], random)
+            counts = torch.cat([self._has_ink(p, side).sum(1) for p in self._parts(waiting, side)])
+            enough = (counts >= least) | (side >= FINEST_GRID)
+            areas[waiting[enough]] = counts[enough] / side**2
+            self._side[waiting[enough]] = side
+            waiting = waiting[~enough]
+            side *= 2
+        height, width = ink.shape[1:]
+        self.coverage = float(areas.mean()) * (height * width / max(height, width) ** 2)
+        """Fraction of the unit square that has ink, averaged over the clouds."""
+        if self._x.is_cuda:
+            # The host does not know which ones are asked for, and all of them take a moment.
+            self._choose(torch.arange(len(ink)))
+
+    @property
+    def x(self) -> Tensor:
+        """Positions in [0, 1]² [length units], shape [M, N, 2]; y is up.
+
+        A picture's longer side is 1.
+        """
+        return self.points(torch.arange(len(self.label), device=self.label.device))
+
+    @makes_plain_tensors
+    def points(self, index: Tensor) -> Tensor:
+        """Return `x` of the pictures `index`, int64 [B], shape [B, N, 2]."""
+        if not self._x.is_cuda:
+            wanted = torch.zeros_like(self._is_missing).index_fill_(0, index, True)
+            self._choose((wanted & self._is_missing).nonzero()[:, 0])
+        return self._x[index]
+
+    def _choose(self, index: Tensor) -> None:
+        """Choose the points of the pictures `index`, int64 [B]."""
+        device = self._x.device
+        for side, (cells, points) in self._grids.items():
+            for part in self._parts(index[self._side[index] == side], side):
+                has_ink = self._has_ink(part, side)[:, cells]
+                candidates = points[_first_true(has_ink, self._most)].to(device)
+                counts = has_ink.sum(1).to(device)
+                choose = _farthest_points if self._x.is_cuda else _farthest_one_by_one
+                chosen = choose(candidates, counts, self._x.shape[1])
+                self._x[part.to(device)] = (chosen + 0.5) / COORDINATE_COUNT
+        self._is_missing[index] = False
+
+    def _parts(self, index: Tensor, side: int) -> tuple[Tensor, ...]:
+        """Return indices in batches with grids of side² cells that memory and caches hold."""
+        most = min(BATCH_SIZES[self._x.device.type], CELLS_PER_BATCH // side**2)
+        return torch.split(index, max(1, most)) if len(index) else ()
+
+    def _has_ink(self, index: Tensor, side: int) -> Tensor:
+        """Return whether pictures, enlarged to side x side, have `INK`, [B, side²]."""
+        enlarged = torch.nn.functional.interpolate(
+            self._relative[index, None], size=(side, side), mode="bilinear", align_corners=False
+        )
+        return enlarged.flatten(1) >= INK
 
 
 @functools.lru_cache(CACHED_DATA_SETS)
+@makes_plain_tensors
 def load_clouds(
     data: str,
     split: Split,
@@ -75,74 +154,16 @@ def load_clouds(
 ) -> PointClouds:
     """Return a cloud of `particle_count` points for each picture of a data set.
 
-    `load_pictures` explains `data`, `split`, `folder`; `sample_ink` the points. Results are cached.
+    `load_pictures` explains `data`, `split`, `folder`. Results are cached.
     """
     ink, label = load_pictures(data, split, folder=folder)
-    x, area = sample_ink(ink, particle_count, sample_seed=sample_seed, device=device)
-    height, width = ink.shape[1:]
-    coverage = area * (height * width / max(height, width) ** 2)
-    summary = ""
     if data != "digits":
-        summary = f"{shown(data)[1:-1]}: {len(ink)} pictures of {width} x {height} to {split}, "
-        summary += f"{len(np.unique(label))} classes"
-        tell(summary)
-    return PointClouds(x, torch.from_numpy(label).to(device), coverage, summary)
-
-
-def sample_ink(
-    ink: NDArray[np.float32],
-    particle_count: int,
-    *,
-    sample_seed: int = 0,
-    device: str | torch.device = "cpu",
-) -> tuple[Tensor, float]:
-    """Return N = `particle_count` points with ink in each of M pictures, and their share of ink.
-
-    The points [M, N, 2] lie in [0, 1]² [length units], where a picture's longer side is 1. They are
-    farthest-point samples of candidates: one random position in each cell of a grid, where the
-    picture, enlarged bilinearly, has ink. The grid is refined until there are enough. Points are
-    the same on every device. The second result is the fraction of the area that has ink, averaged
-    over the pictures. `ink` has shape [M, H, W].
-    """
-    darkest = ink.max((1, 2))
-    if (darkest <= 0).any():
-        raise NPAError(
-            f"every picture must have ink, got an empty one at {int(np.argmin(darkest))}: remove it"
+        height, width = ink.shape[1:]
+        tell(
+            f"{shown(data)[1:-1]}: {len(ink)} pictures of {width} x {height} to {split}, "
+            f"{len(np.unique(label))} classes"
         )
-    least, most = (factor * particle_count for factor in CANDIDATE_FACTORS)
-    relative = torch.from_numpy(ink / darkest[:, None, None])
-    x = torch.empty(len(ink), particle_count, 2, device=device)
-    areas = torch.empty(len(ink))
-    random = torch.Generator().manual_seed(sample_seed)
-    chunk = BATCH_SIZES[torch.device(device).type]
-    waiting = torch.arange(len(ink))
-    side = 1 << math.ceil(math.log2(2.0 * math.sqrt(least)))
-    while len(waiting) > 0:
-        cells, points = _grid_points(side, relative.shape[1:], random)
-        finer = []
-        for part in torch.split(waiting, max(1, min(chunk, CELLS_PER_BATCH // side**2))):
-            has_ink = _has_ink(relative[part], side)[:, cells]
-            counts = has_ink.sum(1)
-            enough = (counts >= least) | (side >= FINEST_GRID)
-            finer.append(part[~enough])
-            part, has_ink, counts = part[enough], has_ink[enough], counts[enough]
-            if len(part) == 0:
-                continue
-            areas[part] = counts / len(cells)
-            x[part.to(device)] = _farthest_points(
-                points[_first_true(has_ink, most)].to(device), counts.to(device), particle_count
-            )
-        waiting = torch.cat(finer)
-        side *= 2
-    return (x + 0.5) / COORDINATE_COUNT, float(areas.mean())
-
-
-def _has_ink(relative: Tensor, side: int) -> Tensor:
-    """Return whether pictures [M, H, W], enlarged to side x side, have `INK`, [M, side²]."""
-    enlarged = torch.nn.functional.interpolate(
-        relative[:, None], size=(side, side), mode="bilinear", align_corners=False
-    )
-    return enlarged.flatten(1) >= INK
+    return PointClouds(ink, label, particle_count, sample_seed=sample_seed, device=device)
 
 
 def _grid_points(
@@ -189,6 +210,23 @@ def _farthest_points(candidates: Tensor, counts: Tensor, particle_count: int) ->
         chosen.append(latest)
     index = torch.cat(chosen, dim=1)[..., None].expand(-1, -1, 2)
     return candidates.gather(1, index)
+
+
+def _farthest_one_by_one(candidates: Tensor, counts: Tensor, particle_count: int) -> Tensor:
+    """Return the same as `_farthest_points`, in less time on a CPU."""
+    clouds = []
+    for cloud, count in zip(candidates.numpy(), counts.tolist(), strict=True):
+        points = cloud[:count]
+        square = np.square(points).sum(1)
+        # |p|² + |q|² - 2 pq as a product: all of its sums are integers below 2²⁴, so exact.
+        rows = np.column_stack((points, np.ones_like(square), square))
+        columns = np.stack((*(-2.0 * points.T), square, np.ones_like(square)))
+        distance, chosen = np.full_like(square, np.inf), [0]
+        for _ in range(particle_count - 1):
+            np.minimum(distance, rows[chosen[-1]] @ columns, out=distance)
+            chosen.append(int(distance.argmax()))
+        clouds.append(torch.from_numpy(points[chosen]))
+    return torch.stack(clouds)
 
 
 def augmented(
@@ -311,22 +349,24 @@ def read_idx(path: Path) -> NDArray[np.uint8]:
 
 def _digits(split: Split) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
     """Return ink and classes of scikit-learn's digits, as `load_pictures`."""
+    spec = importlib.util.find_spec("sklearn")
     try:
-        from sklearn.datasets import load_digits
-    except ImportError as error:
+        # The file by itself, as the import of scikit-learn takes seconds.
+        file = Path((spec and spec.origin) or "").parent / "datasets" / "data" / "digits.csv.gz"
+        table = np.loadtxt(file, np.float32, delimiter=",")
+    except OSError as error:
         raise MissingDependencyError(
             "data='digits' needs scikit-learn: pip install 'npa-envs[points]', or give the folder "
             "of MNIST's IDX files"
         ) from error
-    bunch: Any = load_digits()
-    label = np.asarray(bunch.target, np.int64)
+    label = table[:, 64].astype(np.int64)
     random = np.random.default_rng(SPLIT_SEED)
     is_test = np.zeros(len(label), bool)
     for number in range(10):
         indices = random.permutation(np.flatnonzero(label == number))
         is_test[indices[: round(TEST_FRACTION * len(indices))]] = True
     chosen = is_test if split == "test" else ~is_test
-    return np.asarray(bunch.images, np.float32)[chosen] / 16.0, label[chosen]
+    return table[chosen, :64].reshape(-1, 8, 8) / 16.0, label[chosen]
 
 
 def _idx_file(folder: Path, name: str) -> Path:
