@@ -34,7 +34,7 @@ from npa_envs.ops.perception_passes import (
     saved_together,
     search_threads,
 )
-from npa_envs.ops.physics import ALL_TERMS, Physics, Terms, make_physics
+from npa_envs.ops.physics import Physics, Terms, checked_once, make_physics
 from npa_envs.ops.position_check import checked_positions
 from npa_envs.ops.sort import SortedWorlds, plan_kernels, sort_worlds
 from npa_envs.ops.static_worlds import StaticRows, StaticWorlds, static_worlds
@@ -105,15 +105,10 @@ def perceive(
         NPAError: Shapes, dtypes or devices do not fit, a position is not finite, eps or eps0 is
             not positive and finite, a box side is below 2 eps, or `moment_inverse` is unknown.
     """
-    inverse = checked_choice("moment_inverse", moment_inverse, get_args(MomentInverse))
-    terms = Terms(
-        checked_flag("state_gradient", state_gradient),
-        inverse if checked_flag("moment_correction", moment_correction) else None,
-        checked_flag("density_gradient", density_gradient),
-    )
-    physics = checked_physics(x, s, eps, eps0, box, terms)
+    options = state_gradient, moment_correction, density_gradient, moment_inverse
+    physics = checked_physics(x, s, eps, eps0, box, *options)
     seen, states = x.contiguous(), s.contiguous()
-    if checked_flag("detach_positions", detach_positions):
+    if checked_flag("detach_positions", detach_positions) and seen.requires_grad:
         seen = seen.detach()
     perception: Tensor
     with checked_positions(seen):
@@ -180,12 +175,35 @@ class _Perceive(torch.autograd.Function):
         return positions_bar.view(x_shape) if moving else None, states_bar.view(s_shape), None
 
 
-def checked_physics(
-    x: Tensor, s: Tensor, eps: float, eps0: float | None, box: Box, terms: Terms = ALL_TERMS
-) -> Physics:
-    """Check worlds to perceive, except values, and constants; return these as a `Physics`."""
-    check_world(x, s)
+def checked_physics(x: Tensor, s: Tensor, *options: Any) -> Physics:
+    """Check worlds to perceive, except values, and options; return these as a `Physics`.
+
+    The options are those of `perceive`, but for `detach_positions`, in their order.
+    """
+    physics = _physics(x, s, *options)
     check_derivatives(x=x, s=s)
+    return physics
+
+
+@checked_once
+def _physics(
+    x: Tensor,
+    s: Tensor,
+    eps: float,
+    eps0: float | None,
+    box: Box,
+    state_gradient: bool = True,
+    moment_correction: bool = True,
+    density_gradient: bool = True,
+    moment_inverse: str = "threshold",
+) -> Physics:
+    inverse = checked_choice("moment_inverse", moment_inverse, get_args(MomentInverse))
+    terms = Terms(
+        checked_flag("state_gradient", state_gradient),
+        inverse if checked_flag("moment_correction", moment_correction) else None,
+        checked_flag("density_gradient", density_gradient),
+    )
+    check_world(x, s)
     space_dim, state_dim = x.shape[2], s.shape[2]
     if eps0 is not None:
         eps0 = checked_eps("eps0", eps0, space_dim, x.dtype)
@@ -205,8 +223,7 @@ def perception_fields(
 
     Arguments and errors are those of `perceive`; `moment_inverse` is how `grad1` is corrected.
     """
-    inverse = checked_choice("moment_inverse", moment_inverse, get_args(MomentInverse))
-    physics = checked_physics(x, s, eps, None, box, Terms(moment_inverse=inverse))
+    physics = checked_physics(x, s, eps, None, box, True, True, True, moment_inverse)
     with checked_positions(x):
         *fields, gradients, row_of = _gather_fields(x.contiguous(), s.contiguous(), physics)
         fields.append(gradients[row_of].to(x.dtype).view(x.shape))

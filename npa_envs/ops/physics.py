@@ -6,9 +6,10 @@ import functools
 import math
 from collections.abc import Callable
 from types import NoneType
-from typing import Any, Literal, NamedTuple, ParamSpec, cast, get_args
+from typing import Any, Literal, NamedTuple, ParamSpec, TypeVar, get_args
 
 import torch
+from torch import Tensor, nn
 
 from npa_envs.checks import (
     Box,
@@ -162,26 +163,50 @@ def _constants(value: Any) -> Any:
     return constant(value) if type(value) is float else value
 
 
-IMMUTABLE = frozenset((float, int, bool, str, NoneType, torch.dtype, Terms))
+IMMUTABLE = frozenset((float, int, bool, str, NoneType, torch.dtype, Terms, Physics))
 """Types of arguments that can be keys of a cache."""
 
+MAX_CHECKED = 1024
+"""Maximum number of calls whose results a check keeps."""
+
 Arguments = ParamSpec("Arguments")
+Result = TypeVar("Result")
 
 
-def _cached(make: Callable[Arguments, Physics]) -> Callable[Arguments, Physics]:
-    """Return a function that caches results, unless an argument is mutable or torch compiles."""
-    remembered = cast("Callable[Arguments, Physics]", functools.lru_cache(256, typed=True)(make))
+def checked_once(check: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
+    """Return a check that is made once for tensors of the same forms and the same other arguments.
 
-    @functools.wraps(make)
-    def cached(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Physics:
-        values = *args, *kwargs.values()
-        known = not torch.compiler.is_compiling() and IMMUTABLE.issuperset(map(type, values))
-        return (remembered if known else make)(*args, **kwargs)
+    It must not read tensors' numbers. Arguments are positional. It is made each time if one is
+    mutable, or while torch compiles.
+    """
+    results: dict[tuple[Any, ...], Result] = {}
 
-    return cached
+    @functools.wraps(check)
+    def checked(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Result:
+        if kwargs or torch.compiler.is_compiling():
+            return check(*args, **kwargs)
+        key: list[Any] = []
+        for value in args:
+            kind = type(value)
+            if kind is Tensor or kind is nn.Parameter:
+                form = value.is_nested or value.shape, value.dtype, value.device, value.layout
+                key.append(form)
+            elif kind in IMMUTABLE:
+                # True is 1, and 1 is 1.0.
+                key += (kind, value)
+            else:
+                return check(*args)
+        known = tuple(key)
+        result = results.get(known)
+        if result is None:
+            if len(results) >= MAX_CHECKED:
+                results.clear()
+            result = results[known] = check(*args)
+        return result
+
+    return checked
 
 
-@_cached
 def make_physics(
     space_dim: int,
     state_dim: int,

@@ -10,7 +10,7 @@ from torch import Tensor
 from npa_envs.checks import Box, check_world, checked_choice, checked_count, checked_flag
 from npa_envs.errors import NPAError, shown
 from npa_envs.ops.custom_op import check_derivatives
-from npa_envs.ops.physics import Boundary, Physics, make_physics
+from npa_envs.ops.physics import Boundary, Physics, Terms, checked_once, make_physics
 from npa_envs.rule.rule import NPARule, check_rule
 from npa_envs.world.capture_cache import CUDA_GRAPH_CHOICES, CudaGraph
 from npa_envs.world.divergence import OnDivergence, make_watch
@@ -35,31 +35,54 @@ def checked_physics(
 ) -> Physics:
     """Check that worlds fit a rule and the options are allowed; return the rollout's constants."""
     x, s, *_ = worlds
-    check_world(x, s)
+    of_rule = rule.space_dim, rule.state_dim, rule.eps0, rule.terms, rule.static, rule.alpha
+    numbers = eps, box, boundary, update_prob, dt, position_noise
+    physics = _physics(x, s, rule.hidden.weight, *of_rule, *numbers)
     check_derivatives(x=x, s=s, rule=rule)
-    if (x.shape[2], s.shape[2]) != (rule.space_dim, rule.state_dim):
+    return physics
+
+
+@checked_once
+def _physics(
+    x: Tensor,
+    s: Tensor,
+    weight: Tensor,
+    space_dim: int,
+    state_dim: int,
+    eps0: float,
+    terms: Terms,
+    static: bool,
+    alpha: float,
+    eps: float | None,
+    box: Box,
+    boundary: Boundary | None,
+    update_prob: float,
+    dt: float,
+    position_noise: float,
+) -> Physics:
+    check_world(x, s)
+    if (x.shape[2], s.shape[2]) != (space_dim, state_dim):
         raise NPAError(
-            f"x and s must have the rule's {rule.space_dim} coordinates and {rule.state_dim} "
+            f"x and s must have the rule's {space_dim} coordinates and {state_dim} "
             f"channels, got {tuple(x.shape)} and {tuple(s.shape)}: for example "
-            f"s = torch.zeros(*x.shape[:2], {rule.state_dim})"
+            f"s = torch.zeros(*x.shape[:2], {state_dim})"
         )
-    weight = rule.hidden.weight
     if weight.dtype != x.dtype or weight.device != x.device:
         raise NPAError(
             f"the rule must share dtype and device with x, got {weight.dtype} on {weight.device} "
             f"and {x.dtype} on {x.device}: move it with rule.to(x)"
         )
     return make_physics(
-        rule.space_dim,
-        rule.state_dim,
+        space_dim,
+        state_dim,
         x.dtype,
         eps=eps,
-        eps0=rule.eps0,
+        eps0=eps0,
         box=box,
         boundary=boundary,
-        terms=rule.terms,
-        moving=not rule.static,
-        alpha=rule.alpha,
+        terms=terms,
+        moving=not static,
+        alpha=alpha,
         update_prob=update_prob,
         dt=dt,
         position_noise=position_noise,
@@ -303,29 +326,13 @@ def run_rules(
     return_path_length: bool = False,
 ) -> Particles:
     """Check the options of a rollout and run it; path lengths are None unless asked for."""
-    steps = checked_count("steps", steps)
-    if keep_every is not None:
-        keep_every = checked_count("keep_every", keep_every)
-        if keep_every == 0 or steps == 0 or steps % keep_every:
-            raise NPAError(
-                f"steps must be a multiple of keep_every, got {steps} and {keep_every}: the last "
-                f"world kept is the one at the end"
-            )
-    checked_choice("memory", memory, get_args(Memory))
+    spec = _spec(
+        steps, constants, detach_positions, memory, keep_every, per_species, world_by_world
+    )
     checked_choice("cuda_graph", cuda_graph, CUDA_GRAPH_CHOICES)
-    detach_positions = checked_flag("detach_positions", detach_positions)
     check_generator(generator, worlds.x.device, worlds.x.shape[0])
     after = execute(
-        RolloutSpec(
-            steps,
-            constants,
-            detach_positions,
-            memory,
-            keep_every,
-            tuple(species),
-            per_species,
-            world_by_world,
-        ),
+        spec._replace(species=tuple(species)) if species else spec,
         rules,
         worlds.with_fields(goal=None),
         generator,
@@ -335,3 +342,35 @@ def run_rules(
     )
     path_length = after.path_length if return_path_length else None
     return after.with_fields(path_length=path_length, goal=worlds.goal)
+
+
+@checked_once
+def _spec(
+    steps: int,
+    constants: Physics,
+    detach_positions: bool,
+    memory: Memory,
+    keep_every: int | None,
+    per_species: bool,
+    world_by_world: bool,
+) -> RolloutSpec:
+    """Return checked options of a rollout."""
+    steps = checked_count("steps", steps)
+    if keep_every is not None:
+        keep_every = checked_count("keep_every", keep_every)
+        if keep_every == 0 or steps == 0 or steps % keep_every:
+            raise NPAError(
+                f"steps must be a multiple of keep_every, got {steps} and {keep_every}: the last "
+                f"world kept is the one at the end"
+            )
+    checked_choice("memory", memory, get_args(Memory))
+    detach_positions = checked_flag("detach_positions", detach_positions)
+    return RolloutSpec(
+        steps,
+        constants,
+        detach_positions,
+        memory,
+        keep_every,
+        per_species=per_species,
+        world_by_world=world_by_world,
+    )
