@@ -20,6 +20,7 @@ from npa_envs.checks import (
     checked_choice,
     checked_eps,
     checked_flag,
+    checked_once,
 )
 from npa_envs.ops.custom_op import check_derivatives, custom_op, once_differentiable
 from npa_envs.ops.launch import RecordedLaunches, channel_width, is_aligned, launch
@@ -34,7 +35,7 @@ from npa_envs.ops.perception_passes import (
     saved_together,
     search_threads,
 )
-from npa_envs.ops.physics import Physics, Terms, checked_once, make_physics
+from npa_envs.ops.physics import Physics, Terms, make_physics
 from npa_envs.ops.position_check import checked_positions
 from npa_envs.ops.sort import SortedWorlds, plan_kernels, sort_worlds
 from npa_envs.ops.static_worlds import StaticRows, StaticWorlds, static_worlds
@@ -115,24 +116,25 @@ def perceive(
         if torch.is_grad_enabled() and (seen.requires_grad or states.requires_grad):
             perception = _Perceive.apply(seen, states, physics)  # type: ignore[no-untyped-call]
         else:
-            perception, _ = _perceive(seen, states, physics, False, False)
+            (perception,) = _perceive(seen, states, physics, False, False)
     return perception
 
 
 @custom_op("npa::perceive", of_all=True)
 def _perceive(
     x: Tensor, s: Tensor, physics: Physics, for_adjoint: bool, with_positions: bool
-) -> tuple[Tensor, Tensor]:
-    """Return every particle's perception, [B, N, P], and a block of bytes for the backward pass."""
+) -> list[Tensor]:
+    """Return every particle's perception, [B, N, P], and a block of bytes `for_adjoint`."""
     world_count, particle_count, space_dim = map(int, x.shape)
     total, state_dim = world_count * particle_count, s.shape[2]
     plan = plan_kernels(x, x.shape, state_dim, total, False, physics)
     out = x.new_empty(
         world_count, particle_count, physics.terms.perception_dim(space_dim, plan.state_dim)
     )
-    block, saved, into = x.new_empty(0, dtype=torch.uint8), None, {}
+    results, saved, into = [out], None, {}
     if for_adjoint:
         block, saved = saved_together(plan, out.view(total, -1), with_positions)
+        results.append(block)
         parts = saved._asdict().items()
         into = {k: v for k, v in parts if k in SortedWorlds._fields and v is not None}
     ordered = sort_worlds(plan, x, s, None, into=into)
@@ -149,7 +151,7 @@ def _perceive(
             row_kernel_sum=saved and saved.row_kernel_sum,
         )
     )
-    return out, block
+    return results
 
 
 class _Perceive(torch.autograd.Function):
@@ -169,10 +171,10 @@ class _Perceive(torch.autograd.Function):
         perception, block = ctx.saved_tensors
         x_shape, s_shape = ctx.shapes
         bar, moving = bar.contiguous(), ctx.needs_input_grad[0]
-        states_bar, positions_bar = perceive_backward(
+        states_bar, *positions_bar = perceive_backward(
             bar, perception, block, x_shape[2], s_shape[2], moving, ctx.physics
         )
-        return positions_bar.view(x_shape) if moving else None, states_bar.view(s_shape), None
+        return positions_bar[0] if moving else None, states_bar, None
 
 
 def checked_physics(x: Tensor, s: Tensor, *options: Any) -> Physics:

@@ -2,22 +2,20 @@
 
 from __future__ import annotations
 
-import functools
 import math
-from collections.abc import Callable
-from types import NoneType
-from typing import Any, Literal, NamedTuple, ParamSpec, TypeVar, get_args
+from typing import Any, Literal, NamedTuple, get_args
 
 import torch
-from torch import Tensor, nn
 
 from npa_envs.checks import (
+    IMMUTABLE,
     Box,
     check_scale,
     checked_box,
     checked_choice,
     checked_eps,
     checked_number,
+    checked_once,
     checked_positive,
     constant,
 )
@@ -163,50 +161,10 @@ def _constants(value: Any) -> Any:
     return constant(value) if type(value) is float else value
 
 
-IMMUTABLE = frozenset((float, int, bool, str, NoneType, torch.dtype, Terms, Physics))
-"""Types of arguments that can be keys of a cache."""
-
-MAX_CHECKED = 1024
-"""Maximum number of calls whose results a check keeps."""
-
-Arguments = ParamSpec("Arguments")
-Result = TypeVar("Result")
+IMMUTABLE.update((Terms, Physics))
 
 
-def checked_once(check: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
-    """Return a check that is made once for tensors of the same forms and the same other arguments.
-
-    It must not read tensors' numbers. Arguments are positional. It is made each time if one is
-    mutable, or while torch compiles.
-    """
-    results: dict[tuple[Any, ...], Result] = {}
-
-    @functools.wraps(check)
-    def checked(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Result:
-        if kwargs or torch.compiler.is_compiling():
-            return check(*args, **kwargs)
-        key: list[Any] = []
-        for value in args:
-            kind = type(value)
-            if kind is Tensor or kind is nn.Parameter:
-                form = value.is_nested or value.shape, value.dtype, value.device, value.layout
-                key.append(form)
-            elif kind in IMMUTABLE:
-                # True is 1, and 1 is 1.0.
-                key += (kind, value)
-            else:
-                return check(*args)
-        known = tuple(key)
-        result = results.get(known)
-        if result is None:
-            if len(results) >= MAX_CHECKED:
-                results.clear()
-            result = results[known] = check(*args)
-        return result
-
-    return checked
-
-
+@checked_once
 def make_physics(
     space_dim: int,
     state_dim: int,

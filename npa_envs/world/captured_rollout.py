@@ -281,7 +281,7 @@ class CapturedRollout:
         """Replay a call's graphs; return copies of the worlds. `use` lives until the last pass."""
         generator = call.generator
         inputs = self._inputs_of(call)
-        check = PositionCheck(call.particles.x.detach())
+        check = PositionCheck(call.particles.x)
         results: list[Particles] = []
         for steps in call.blocks:
             if self.differentiable:

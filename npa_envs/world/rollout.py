@@ -7,10 +7,17 @@ from typing import Any, get_args
 
 from torch import Tensor
 
-from npa_envs.checks import Box, check_world, checked_choice, checked_count, checked_flag
+from npa_envs.checks import (
+    Box,
+    check_world,
+    checked_choice,
+    checked_count,
+    checked_flag,
+    checked_once,
+)
 from npa_envs.errors import NPAError, shown
 from npa_envs.ops.custom_op import check_derivatives
-from npa_envs.ops.physics import Boundary, Physics, Terms, checked_once, make_physics
+from npa_envs.ops.physics import Boundary, Physics, make_physics
 from npa_envs.rule.rule import NPARule, check_rule
 from npa_envs.world.capture_cache import CUDA_GRAPH_CHOICES, CudaGraph
 from npa_envs.world.divergence import OnDivergence, make_watch
@@ -22,44 +29,21 @@ from npa_envs.world.steps import SpeciesSpec
 __all__ = ["Memory", "at_rest", "rollout", "step"]
 
 
-def checked_physics(
-    rule: NPARule,
-    worlds: Particles,
-    *,
-    eps: float | None = None,
-    box: Box = None,
-    boundary: Boundary | None = None,
-    update_prob: float = 0.5,
-    dt: float = 1.0,
-    position_noise: float = 0.0,
-) -> Physics:
-    """Check that worlds fit a rule and the options are allowed; return the rollout's constants."""
+def checked_physics(rule: NPARule, worlds: Particles, **options: Any) -> Physics:
+    """Check that worlds fit a rule and the options are allowed; return the rollout's constants.
+
+    The options are those of `make_physics` that are not the rule's.
+    """
     x, s, *_ = worlds
     of_rule = rule.space_dim, rule.state_dim, rule.eps0, rule.terms, rule.static, rule.alpha
-    numbers = eps, box, boundary, update_prob, dt, position_noise
-    physics = _physics(x, s, rule.hidden.weight, *of_rule, *numbers)
+    constants = _physics(x, s, rule.hidden.weight, *of_rule, **options)
     check_derivatives(x=x, s=s, rule=rule)
-    return physics
+    return constants
 
 
 @checked_once
-def _physics(
-    x: Tensor,
-    s: Tensor,
-    weight: Tensor,
-    space_dim: int,
-    state_dim: int,
-    eps0: float,
-    terms: Terms,
-    static: bool,
-    alpha: float,
-    eps: float | None,
-    box: Box,
-    boundary: Boundary | None,
-    update_prob: float,
-    dt: float,
-    position_noise: float,
-) -> Physics:
+def _physics(x: Tensor, s: Tensor, weight: Tensor, *of_rule: Any, **options: Any) -> Physics:
+    space_dim, state_dim, eps0, terms, static, alpha = of_rule
     check_world(x, s)
     if (x.shape[2], s.shape[2]) != (space_dim, state_dim):
         raise NPAError(
@@ -72,21 +56,8 @@ def _physics(
             f"the rule must share dtype and device with x, got {weight.dtype} on {weight.device} "
             f"and {x.dtype} on {x.device}: move it with rule.to(x)"
         )
-    return make_physics(
-        space_dim,
-        state_dim,
-        x.dtype,
-        eps=eps,
-        eps0=eps0,
-        box=box,
-        boundary=boundary,
-        terms=terms,
-        moving=not static,
-        alpha=alpha,
-        update_prob=update_prob,
-        dt=dt,
-        position_noise=position_noise,
-    )
+    options = {"eps": None, "terms": terms, "moving": not static, "alpha": alpha} | options
+    return make_physics(space_dim, state_dim, x.dtype, eps0=eps0, **options)
 
 
 def _check_rule_of_one_species(rule: NPARule) -> None:
@@ -326,13 +297,15 @@ def run_rules(
     return_path_length: bool = False,
 ) -> Particles:
     """Check the options of a rollout and run it; path lengths are None unless asked for."""
-    spec = _spec(
-        steps, constants, detach_positions, memory, keep_every, per_species, world_by_world
-    )
+    options = steps, constants, detach_positions, memory, keep_every, per_species, world_by_world
+    spec = _checked_spec(*options)
+    if species:
+        # Not by `_replace`, which torch.compile cannot trace.
+        spec = RolloutSpec(*spec[:5], tuple(species), *spec[6:])
     checked_choice("cuda_graph", cuda_graph, CUDA_GRAPH_CHOICES)
     check_generator(generator, worlds.x.device, worlds.x.shape[0])
     after = execute(
-        spec._replace(species=tuple(species)) if species else spec,
+        spec,
         rules,
         worlds.with_fields(goal=None),
         generator,
@@ -345,16 +318,15 @@ def run_rules(
 
 
 @checked_once
-def _spec(
+def _checked_spec(
     steps: int,
     constants: Physics,
     detach_positions: bool,
     memory: Memory,
     keep_every: int | None,
-    per_species: bool,
-    world_by_world: bool,
+    *of_species: bool,
 ) -> RolloutSpec:
-    """Return checked options of a rollout."""
+    """Return the options of a rollout of one species after checking them."""
     steps = checked_count("steps", steps)
     if keep_every is not None:
         keep_every = checked_count("keep_every", keep_every)
@@ -364,13 +336,5 @@ def _spec(
                 f"world kept is the one at the end"
             )
     checked_choice("memory", memory, get_args(Memory))
-    detach_positions = checked_flag("detach_positions", detach_positions)
-    return RolloutSpec(
-        steps,
-        constants,
-        detach_positions,
-        memory,
-        keep_every,
-        per_species=per_species,
-        world_by_world=world_by_world,
-    )
+    detached = checked_flag("detach_positions", detach_positions)
+    return RolloutSpec(steps, constants, detached, memory, keep_every, (), *of_species)
