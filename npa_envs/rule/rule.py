@@ -373,8 +373,8 @@ class NPARule(nn.Module):
             if type(layer) is not nn.Linear or is_altered(layer) or _has_backward_hooks(layer):
                 return False
         return (
-            layers["hidden"]._parameters.get("bias") is not None  # type: ignore[union-attr]
-            and layers["output"]._parameters.get("bias") is None  # type: ignore[union-attr]
+            getattr(layers["hidden"], "bias", None) is not None
+            and getattr(layers["output"], "bias", None) is None
             and not (is_altered(self) or _has_backward_hooks(self))
             and not _has_any_global_hook()  # type: ignore[no-untyped-call]
         )
