@@ -472,28 +472,29 @@ def repeated(function: Callable[..., Any], arguments: Sequence[Any]) -> Any:
         return function(*arguments)
     tensors: list[Tensor] = []
     key: list[Hashable] = [function]
-    for argument in arguments:
-        if type(argument) is list:
-            key.append(len(argument))
-            values: Sequence[Any] = argument
+    values = [*arguments]
+    for value in values:
+        cls = type(value)
+        if cls is Tensor or cls is nn.Parameter:
+            if not value.is_contiguous():
+                return function(*arguments)
+            tensors.append(value)
+            key += (value.shape, value.dtype, value.device, value.data_ptr() % ALIGNED_BYTES)
+        elif cls is list:
+            # Its entries follow after all arguments.
+            key.append(len(value))
+            values += value
+        elif isinstance(value, Tensor):
+            return function(*arguments)
         else:
-            values = (argument,)
-        for value in values:
-            if isinstance(value, Tensor):
-                if type(value) not in (Tensor, nn.Parameter) or not value.is_contiguous():
-                    return function(*arguments)
-                tensors.append(value)
-                place = value.data_ptr() % ALIGNED_BYTES
-                key.append((value.shape, value.dtype, value.device, place))
-            else:
-                key.append(value)
+            key.append(value)
     of_thread, kind = _thread.calls, tuple(key)
-    calls = of_thread.pop(kind, 0)
-    of_thread[kind] = calls if isinstance(calls, _Repeat) else calls + 1
-    if len(of_thread) > MAX_REPEATED:
-        of_thread.popitem(last=False)
+    calls = of_thread.get(kind, 0)
     if isinstance(calls, _Repeat):
         return calls.run(tensors)
+    of_thread[kind] = calls + 1
+    if len(of_thread) > MAX_REPEATED:
+        of_thread.popitem(last=False)
     if calls != CALLED_FIRST:
         return function(*arguments)
     recorded, watch = RecordedLaunches(), _WatchedOperators()
