@@ -228,7 +228,7 @@ def perception_fields(
     physics = checked_physics(x, s, eps, None, box, True, True, True, moment_inverse)
     with checked_positions(x):
         *fields, gradients, row_of = _gather_fields(x.contiguous(), s.contiguous(), physics)
-        fields.append(gradients[row_of].to(x.dtype).view(x.shape))
+        fields.append(gradients.index_select(0, row_of).to(x.dtype).view(x.shape))
     return PerceptionFields._make(fields)
 
 
