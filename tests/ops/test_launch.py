@@ -147,6 +147,9 @@ def test_threads_and_modes_repeat_on_their_own(device):
     with ThreadPoolExecutor(3) as pool:
         for done in [pool.submit(work) for _ in range(3)]:
             done.result()
+    with torch.autograd.set_multithreading_enabled(False):
+        for _ in range(4):
+            assert_same(perceived(x, s), expected)
 
 
 def test_a_check_of_positions_waits_for_late_reports(monkeypatch):
