@@ -7,18 +7,22 @@ is what the error calls the value.
 from __future__ import annotations
 
 import contextlib
+import functools
 import math
 import operator
 import sys
 from collections.abc import Callable, Sequence
-from typing import Any, Literal, TypeGuard, TypeVar
+from types import NoneType
+from typing import Any, Literal, ParamSpec, TypeGuard, TypeVar, cast
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from npa_envs.errors import NPAError, shown, suggest
 
 Choice = TypeVar("Choice")
+Arguments = ParamSpec("Arguments")
+Result = TypeVar("Result")
 
 DTYPES = (torch.float32, torch.float64)
 
@@ -40,6 +44,49 @@ MomentInverse = Literal["threshold", "smooth"]
 
 Box = float | Sequence[float] | None
 """Sides of a periodic box centred on the origin [length units], one number for all; None: open."""
+
+
+IMMUTABLE: set[type] = {float, int, bool, str, NoneType, torch.dtype}
+"""Types of arguments whose values `checked_once` compares."""
+
+MAX_CHECKED = 1024
+"""Maximum number of calls whose results a check keeps."""
+
+
+def checked_once(check: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
+    """Return a check that is made once for tensors of the same forms and equal other arguments.
+
+    It must not read tensors' numbers. It is made each time if an argument is mutable, or while
+    torch compiles.
+    """
+    results: dict[Any, Result] = {}
+
+    @functools.wraps(check)
+    def checked(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Result:
+        if torch.compiler.is_compiling():
+            return check(*args, **kwargs)
+        forms: list[Any] = [*kwargs]
+        values: tuple[Any, ...] = (*args, *kwargs.values())
+        for value in values:
+            kind = type(value)
+            if kind in IMMUTABLE:
+                # With the type: True is 1, and 1 is 1.0.
+                forms += (kind, value)
+            elif kind is Tensor or kind is nn.Parameter:
+                forms += (value.is_nested or value.shape, value.dtype, value.device, value.layout)
+            else:
+                return check(*args, **kwargs)
+        key = tuple(forms)
+        # `results` where there is no result, as that may be None.
+        result: Any = results.get(key, results)
+        if result is results:
+            result = check(*args, **kwargs)
+            if len(results) >= MAX_CHECKED:
+                results.clear()
+            results[key] = result
+        return cast("Result", result)
+
+    return checked
 
 
 def check_dense(name: str, tensor: Tensor) -> None:
@@ -77,6 +124,7 @@ def check_alike(name: str, tensor: Tensor, other_name: str, other: Tensor) -> No
         )
 
 
+@checked_once
 def check_world(x: Tensor, s: Tensor) -> None:
     """Check shapes, dtypes and devices of positions and states."""
     for name, tensor, last in (("x", x, "D"), ("s", s, "C")):

@@ -120,12 +120,14 @@ class DriverLaunch:
 
     def run(self, thread_count: int, stream: int) -> bool:
         """Launch `thread_count` threads on a stream; return False if nothing was launched."""
-        other_device = torch.cuda.current_device() != self._device.index
+        # Torch's public functions also ask whether CUDA has been initialised.
+        other_device = torch._C._cuda_getDevice() != self._device.index
         if self._launch is None or thread_count > MAX_THREADS or other_device:
             return False
         config = self._config
         config.grid_x = -(-thread_count // self._block)
         config.stream = stream
-        early = self._waits and torch.cuda.is_current_stream_capturing() and _follows_kernel(stream)
-        config.attribute_count = int(early)
+        if self._waits:
+            early = torch._C._cuda_isCurrentStreamCapturing() and _follows_kernel(stream)
+            config.attribute_count = int(early)
         return not self._launch(self._config_address, self._function, self._addresses, None)

@@ -472,25 +472,29 @@ def repeated(function: Callable[..., Any], arguments: Sequence[Any]) -> Any:
         return function(*arguments)
     tensors: list[Tensor] = []
     key: list[Hashable] = [function]
-    for argument in arguments:
-        several = type(argument) is list
-        for value in argument if several else (argument,):
-            if isinstance(value, Tensor):
-                if type(value) not in (Tensor, nn.Parameter) or not value.is_contiguous():
-                    return function(*arguments)
-                tensors.append(value)
-                place = value.data_ptr() % ALIGNED_BYTES
-                key += (value.shape, value.dtype, value.device, place)
-            else:
-                key.append(value)
-        key.append(several)
+    values = [*arguments]
+    for value in values:
+        cls = type(value)
+        if cls is Tensor or cls is nn.Parameter:
+            if not value.is_contiguous():
+                return function(*arguments)
+            tensors.append(value)
+            key += (value.shape, value.dtype, value.device, value.data_ptr() % ALIGNED_BYTES)
+        elif cls is list:
+            # Its entries follow after all arguments.
+            key.append(len(value))
+            values += value
+        elif isinstance(value, Tensor):
+            return function(*arguments)
+        else:
+            key.append(value)
     of_thread, kind = _thread.calls, tuple(key)
-    calls = of_thread.pop(kind, 0)
-    of_thread[kind] = calls if isinstance(calls, _Repeat) else calls + 1
-    if len(of_thread) > MAX_REPEATED:
-        of_thread.popitem(last=False)
+    calls = of_thread.get(kind, 0)
     if isinstance(calls, _Repeat):
         return calls.run(tensors)
+    of_thread[kind] = calls + 1
+    if len(of_thread) > MAX_REPEATED:
+        of_thread.popitem(last=False)
     if calls != CALLED_FIRST:
         return function(*arguments)
     recorded, watch = RecordedLaunches(), _WatchedOperators()
@@ -541,7 +545,10 @@ class _Repeat:
     ) -> None:
         self._several = None if isinstance(results, Tensor) else type(results)
         made: list[Tensor] = [results] if self._several is None else [*results]
-        self._forms = [(each.shape, each.dtype, each.device) for each in made]
+        self._makes = [
+            functools.partial(torch.empty, each.shape, dtype=each.dtype, device=each.device)
+            for each in made
+        ]
         self._launches, self._block_bytes = recorded.launches, 0
         self._addresses: list[tuple[Any, int, int]] = []
         """Addresses in arguments, each with the index of a result or input, and a distance [bytes]
@@ -572,7 +579,7 @@ class _Repeat:
 
     def run(self, inputs: Sequence[Tensor]) -> Any:
         """Return the operator's results for other tensors."""
-        made = [torch.empty(shape, dtype=dtype, device=on) for shape, dtype, on in self._forms]
+        made = [make() for make in self._makes]
         begins = [tensor.data_ptr() for tensor in (*made, *inputs)]
         if self._block_bytes:
             device = inputs[0].device

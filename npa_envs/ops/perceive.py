@@ -20,6 +20,7 @@ from npa_envs.checks import (
     checked_choice,
     checked_eps,
     checked_flag,
+    checked_once,
 )
 from npa_envs.ops.custom_op import check_derivatives, custom_op, once_differentiable
 from npa_envs.ops.launch import RecordedLaunches, channel_width, is_aligned, launch
@@ -34,7 +35,7 @@ from npa_envs.ops.perception_passes import (
     saved_together,
     search_threads,
 )
-from npa_envs.ops.physics import ALL_TERMS, Physics, Terms, make_physics
+from npa_envs.ops.physics import Physics, Terms, make_physics
 from npa_envs.ops.position_check import checked_positions
 from npa_envs.ops.sort import SortedWorlds, plan_kernels, sort_worlds
 from npa_envs.ops.static_worlds import StaticRows, StaticWorlds, static_worlds
@@ -105,39 +106,35 @@ def perceive(
         NPAError: Shapes, dtypes or devices do not fit, a position is not finite, eps or eps0 is
             not positive and finite, a box side is below 2 eps, or `moment_inverse` is unknown.
     """
-    inverse = checked_choice("moment_inverse", moment_inverse, get_args(MomentInverse))
-    terms = Terms(
-        checked_flag("state_gradient", state_gradient),
-        inverse if checked_flag("moment_correction", moment_correction) else None,
-        checked_flag("density_gradient", density_gradient),
-    )
-    physics = checked_physics(x, s, eps, eps0, box, terms)
+    options = state_gradient, moment_correction, density_gradient, moment_inverse
+    physics = checked_physics(x, s, eps, eps0, box, *options)
     seen, states = x.contiguous(), s.contiguous()
-    if checked_flag("detach_positions", detach_positions):
+    if checked_flag("detach_positions", detach_positions) and seen.requires_grad:
         seen = seen.detach()
     perception: Tensor
     with checked_positions(seen):
         if torch.is_grad_enabled() and (seen.requires_grad or states.requires_grad):
             perception = _Perceive.apply(seen, states, physics)  # type: ignore[no-untyped-call]
         else:
-            perception, _ = _perceive(seen, states, physics, False, False)
+            (perception,) = _perceive(seen, states, physics, False, False)
     return perception
 
 
 @custom_op("npa::perceive", of_all=True)
 def _perceive(
     x: Tensor, s: Tensor, physics: Physics, for_adjoint: bool, with_positions: bool
-) -> tuple[Tensor, Tensor]:
-    """Return every particle's perception, [B, N, P], and a block of bytes for the backward pass."""
+) -> list[Tensor]:
+    """Return every particle's perception, [B, N, P], and a block of bytes `for_adjoint`."""
     world_count, particle_count, space_dim = map(int, x.shape)
     total, state_dim = world_count * particle_count, s.shape[2]
     plan = plan_kernels(x, x.shape, state_dim, total, False, physics)
     out = x.new_empty(
         world_count, particle_count, physics.terms.perception_dim(space_dim, plan.state_dim)
     )
-    block, saved, into = x.new_empty(0, dtype=torch.uint8), None, {}
+    results, saved, into = [out], None, {}
     if for_adjoint:
         block, saved = saved_together(plan, out.view(total, -1), with_positions)
+        results.append(block)
         parts = saved._asdict().items()
         into = {k: v for k, v in parts if k in SortedWorlds._fields and v is not None}
     ordered = sort_worlds(plan, x, s, None, into=into)
@@ -154,7 +151,7 @@ def _perceive(
             row_kernel_sum=saved and saved.row_kernel_sum,
         )
     )
-    return out, block
+    return results
 
 
 class _Perceive(torch.autograd.Function):
@@ -174,18 +171,41 @@ class _Perceive(torch.autograd.Function):
         perception, block = ctx.saved_tensors
         x_shape, s_shape = ctx.shapes
         bar, moving = bar.contiguous(), ctx.needs_input_grad[0]
-        states_bar, positions_bar = perceive_backward(
+        states_bar, *positions_bar = perceive_backward(
             bar, perception, block, x_shape[2], s_shape[2], moving, ctx.physics
         )
-        return positions_bar.view(x_shape) if moving else None, states_bar.view(s_shape), None
+        return positions_bar[0] if moving else None, states_bar, None
 
 
-def checked_physics(
-    x: Tensor, s: Tensor, eps: float, eps0: float | None, box: Box, terms: Terms = ALL_TERMS
-) -> Physics:
-    """Check worlds to perceive, except values, and constants; return these as a `Physics`."""
-    check_world(x, s)
+def checked_physics(x: Tensor, s: Tensor, *options: Any) -> Physics:
+    """Check worlds to perceive, except values, and options; return these as a `Physics`.
+
+    The options are those of `perceive`, but for `detach_positions`, in their order.
+    """
+    physics = _physics(x, s, *options)
     check_derivatives(x=x, s=s)
+    return physics
+
+
+@checked_once
+def _physics(
+    x: Tensor,
+    s: Tensor,
+    eps: float,
+    eps0: float | None,
+    box: Box,
+    state_gradient: bool = True,
+    moment_correction: bool = True,
+    density_gradient: bool = True,
+    moment_inverse: str = "threshold",
+) -> Physics:
+    inverse = checked_choice("moment_inverse", moment_inverse, get_args(MomentInverse))
+    terms = Terms(
+        checked_flag("state_gradient", state_gradient),
+        inverse if checked_flag("moment_correction", moment_correction) else None,
+        checked_flag("density_gradient", density_gradient),
+    )
+    check_world(x, s)
     space_dim, state_dim = x.shape[2], s.shape[2]
     if eps0 is not None:
         eps0 = checked_eps("eps0", eps0, space_dim, x.dtype)
@@ -205,11 +225,10 @@ def perception_fields(
 
     Arguments and errors are those of `perceive`; `moment_inverse` is how `grad1` is corrected.
     """
-    inverse = checked_choice("moment_inverse", moment_inverse, get_args(MomentInverse))
-    physics = checked_physics(x, s, eps, None, box, Terms(moment_inverse=inverse))
+    physics = checked_physics(x, s, eps, None, box, True, True, True, moment_inverse)
     with checked_positions(x):
         *fields, gradients, row_of = _gather_fields(x.contiguous(), s.contiguous(), physics)
-        fields.append(gradients[row_of].to(x.dtype).view(x.shape))
+        fields.append(gradients.index_select(0, row_of).to(x.dtype).view(x.shape))
     return PerceptionFields._make(fields)
 
 

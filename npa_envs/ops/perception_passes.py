@@ -307,16 +307,17 @@ def perceive_backward(
     state_dim: int,
     with_positions: bool,
     physics: Physics,
-) -> tuple[Tensor, Tensor]:
-    """Return gradients as `perceive_rows_backward`, from that of every particle, [B, N, P].
+) -> list[Tensor]:
+    """Return gradients of states and, if asked for, of positions from that of perception.
 
     `block` is that of `saved_together`.
     """
     bar, rows = perception_bar.flatten(0, 1), perception.flatten(0, 1)
-    shape = (*map(int, perception.shape[:2]), space_dim)
-    plan = plan_kernels(rows, shape, state_dim, len(rows), False, physics)
+    worlds = tuple(map(int, perception.shape[:2]))
+    plan = plan_kernels(rows, (*worlds, space_dim), state_dim, len(rows), False, physics)
     _, saved = saved_together(plan, rows, with_positions, block)
-    return _pull_back(plan, saved, [], bar, saved.original_index)
+    gradients = _pull_back(plan, saved, [], bar, saved.original_index)
+    return [gradient.view(*worlds, -1) for gradient in gradients[: 1 + with_positions]]
 
 
 @custom_op("npa::perceive_rows_backward")

@@ -2,21 +2,20 @@
 
 from __future__ import annotations
 
-import functools
 import math
-from collections.abc import Callable
-from types import NoneType
-from typing import Any, Literal, NamedTuple, ParamSpec, cast, get_args
+from typing import Any, Literal, NamedTuple, get_args
 
 import torch
 
 from npa_envs.checks import (
+    IMMUTABLE,
     Box,
     check_scale,
     checked_box,
     checked_choice,
     checked_eps,
     checked_number,
+    checked_once,
     checked_positive,
     constant,
 )
@@ -162,26 +161,10 @@ def _constants(value: Any) -> Any:
     return constant(value) if type(value) is float else value
 
 
-IMMUTABLE = frozenset((float, int, bool, str, NoneType, torch.dtype, Terms))
-"""Types of arguments that can be keys of a cache."""
-
-Arguments = ParamSpec("Arguments")
+IMMUTABLE.update((Terms, Physics))
 
 
-def _cached(make: Callable[Arguments, Physics]) -> Callable[Arguments, Physics]:
-    """Return a function that caches results, unless an argument is mutable or torch compiles."""
-    remembered = cast("Callable[Arguments, Physics]", functools.lru_cache(256, typed=True)(make))
-
-    @functools.wraps(make)
-    def cached(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Physics:
-        values = *args, *kwargs.values()
-        known = not torch.compiler.is_compiling() and IMMUTABLE.issuperset(map(type, values))
-        return (remembered if known else make)(*args, **kwargs)
-
-    return cached
-
-
-@_cached
+@checked_once
 def make_physics(
     space_dim: int,
     state_dim: int,

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
+import functools
 import itertools
+import os
 import threading
 import time
-from collections.abc import Iterator
 
 import torch
 from torch import Tensor
@@ -22,11 +23,15 @@ THREADS = 2048
 MAX_NUMBERS = 2**18
 """Maximum number of coordinates that they check; work on more hides torch's slower check."""
 
-PATIENT_READS, QUERY_INTERVAL = 64, 4096
+PATIENT_READS, QUERY_INTERVAL = 64, 2**17
 """Reads of all reports after which the host lets others run, and asks if the stream has failed."""
 
 CHECKS = 100
 """Number of checks of a thread after which devices report the same words again."""
+
+
+# On Linux a sleep of no time takes 50 µs.
+_let_others_run = getattr(os, "sched_yield", functools.partial(time.sleep, 0.0))
 
 
 class _Host(threading.local):
@@ -40,21 +45,15 @@ class _Host(threading.local):
 _host = _Host()
 
 
-@contextlib.contextmanager
-def checked_positions(x: Tensor) -> Iterator[None]:
+def checked_positions(x: Tensor) -> contextlib.AbstractContextManager[object]:
     """Check that all positions are finite while the block launches work; raise NPAError after it.
 
     On a CPU they are checked first. Nothing is checked while torch compiles or captures.
     """
     # In this order: torch.compile cannot trace the other calls.
     if torch.compiler.is_compiling() or (x.is_cuda and torch.cuda.is_current_stream_capturing()):
-        yield
-        return
-    check = PositionCheck(x)
-    try:
-        yield
-    finally:
-        check.wait()
+        return contextlib.nullcontext()
+    return PositionCheck(x)
 
 
 class PositionCheck:
@@ -65,7 +64,7 @@ class PositionCheck:
     """
 
     def __init__(self, x: Tensor) -> None:
-        self._x, self._slow = x.detach(), FiniteCheck(x) if _is_slow(x) else None
+        self._x, self._slow = x, FiniteCheck(x) if _is_slow(x) else None
         if self._slow is not None:
             if not x.is_cuda:
                 self._slow.wait()
@@ -81,6 +80,13 @@ class PositionCheck:
         # It writes to the host's memory: a copy and an event would take more CPU time.
         kernel = report_finite(SCALARS[x.dtype])
         launch(kernel, THREADS, x.device, THREADS, self._finite, self._x, reports)
+
+    def __enter__(self) -> None:
+        """Begin the block that `checked_positions` describes."""
+
+    def __exit__(self, *_: object) -> None:
+        """Wait for the check and raise its error."""
+        self.wait()
 
     def wait(self) -> None:
         """Wait for the check, not for work after it; raise NPAError if a position is not finite."""
@@ -99,7 +105,7 @@ class PositionCheck:
             if reads % QUERY_INTERVAL == 0 and torch.cuda.current_stream(self._x.device).query():
                 break
             if reads > PATIENT_READS:
-                time.sleep(0.0)
+                _let_others_run()
         FiniteCheck(self._x).wait()
 
 

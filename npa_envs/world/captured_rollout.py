@@ -97,6 +97,8 @@ class CapturedRollout:
     def __init__(self, call: RolloutCall) -> None:
         x = call.particles.x
         self.device = x.device
+        # Made once: that takes longer than its use.
+        self._on_device = torch.cuda.device(self.device)
         worlds = call.particles.with_zero_paths()
         _, _, self._zero_paths, *_ = worlds
         self.bytes = 0
@@ -281,7 +283,7 @@ class CapturedRollout:
         """Replay a call's graphs; return copies of the worlds. `use` lives until the last pass."""
         generator = call.generator
         inputs = self._inputs_of(call)
-        check = PositionCheck(call.particles.x.detach())
+        check = PositionCheck(call.particles.x)
         results: list[Particles] = []
         for steps in call.blocks:
             if self.differentiable:
@@ -330,7 +332,7 @@ class CapturedRollout:
         self, steps: int, tensors: Sequence[Tensor], generator: Randomness | None
     ) -> list[Tensor]:
         """Replay a rollout, and return copies of the resulting worlds; not differentiable."""
-        with torch.cuda.device(self.device):
+        with self._on_device:
             self._wait_for_last_use()
             torch._foreach_copy_(self._inputs, list(tensors))
             self._load_draws(generator, steps)
@@ -343,7 +345,7 @@ class CapturedRollout:
         self, steps: int, cotangents: Sequence[Tensor | None], grad_flags: Sequence[bool]
     ) -> list[Tensor | None]:
         """Replay the last rollout's backward pass; return copies of gradients, None if unneeded."""
-        with torch.cuda.device(self.device):
+        with self._on_device:
             self._wait_for_last_use()
             for buffer, cotangent in zip(self._cotangents_of(steps), cotangents, strict=True):
                 buffer.zero_() if cotangent is None else buffer.copy_(cotangent)

@@ -152,8 +152,9 @@ class DivergenceWatch:
 
 def make_watch(on_divergence: str, worlds: Particles) -> DivergenceWatch | None:
     """Return a watch for divergence of these worlds; None with `on_divergence="ignore"`."""
-    if checked_choice("on_divergence", on_divergence, get_args(OnDivergence)) == "ignore":
+    if on_divergence == "ignore":
         return None
+    checked_choice("on_divergence", on_divergence, get_args(OnDivergence))
     if worlds.x.is_cuda and torch.cuda.is_current_stream_capturing():
         raise NPAError(
             "on_divergence must be 'ignore' while a CUDA graph is captured, got 'raise', which "

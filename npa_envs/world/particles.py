@@ -28,7 +28,9 @@ class Particles(NamedTuple):
 
     def with_fields(self, **values: Tensor | None) -> Particles:
         """Return the worlds with other values of some fields; unlike `_replace` it compiles."""
-        return Particles(*(values.get(name, getattr(self, name)) for name in self._fields))
+        x, s, path, goal = self
+        take = values.get
+        return Particles(take("x", x), take("s", s), take("path_length", path), take("goal", goal))  # type: ignore[arg-type]
 
     def moved(self, x: Tensor, s: Tensor, path_length: Tensor) -> Particles:
         """Return the worlds with other positions, states and path lengths."""

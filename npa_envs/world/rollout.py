@@ -7,7 +7,14 @@ from typing import Any, get_args
 
 from torch import Tensor
 
-from npa_envs.checks import Box, check_world, checked_choice, checked_count, checked_flag
+from npa_envs.checks import (
+    Box,
+    check_world,
+    checked_choice,
+    checked_count,
+    checked_flag,
+    checked_once,
+)
 from npa_envs.errors import NPAError, shown
 from npa_envs.ops.custom_op import check_derivatives
 from npa_envs.ops.physics import Boundary, Physics, make_physics
@@ -22,48 +29,35 @@ from npa_envs.world.steps import SpeciesSpec
 __all__ = ["Memory", "at_rest", "rollout", "step"]
 
 
-def checked_physics(
-    rule: NPARule,
-    worlds: Particles,
-    *,
-    eps: float | None = None,
-    box: Box = None,
-    boundary: Boundary | None = None,
-    update_prob: float = 0.5,
-    dt: float = 1.0,
-    position_noise: float = 0.0,
-) -> Physics:
-    """Check that worlds fit a rule and the options are allowed; return the rollout's constants."""
+def checked_physics(rule: NPARule, worlds: Particles, **options: Any) -> Physics:
+    """Check that worlds fit a rule and the options are allowed; return the rollout's constants.
+
+    The options are those of `make_physics` that are not the rule's.
+    """
     x, s, *_ = worlds
-    check_world(x, s)
+    of_rule = rule.space_dim, rule.state_dim, rule.eps0, rule.terms, rule.static, rule.alpha
+    constants = _physics(x, s, rule.hidden.weight, *of_rule, **options)
     check_derivatives(x=x, s=s, rule=rule)
-    if (x.shape[2], s.shape[2]) != (rule.space_dim, rule.state_dim):
+    return constants
+
+
+@checked_once
+def _physics(x: Tensor, s: Tensor, weight: Tensor, *of_rule: Any, **options: Any) -> Physics:
+    space_dim, state_dim, eps0, terms, static, alpha = of_rule
+    check_world(x, s)
+    if (x.shape[2], s.shape[2]) != (space_dim, state_dim):
         raise NPAError(
-            f"x and s must have the rule's {rule.space_dim} coordinates and {rule.state_dim} "
+            f"x and s must have the rule's {space_dim} coordinates and {state_dim} "
             f"channels, got {tuple(x.shape)} and {tuple(s.shape)}: for example "
-            f"s = torch.zeros(*x.shape[:2], {rule.state_dim})"
+            f"s = torch.zeros(*x.shape[:2], {state_dim})"
         )
-    weight = rule.hidden.weight
     if weight.dtype != x.dtype or weight.device != x.device:
         raise NPAError(
             f"the rule must share dtype and device with x, got {weight.dtype} on {weight.device} "
             f"and {x.dtype} on {x.device}: move it with rule.to(x)"
         )
-    return make_physics(
-        rule.space_dim,
-        rule.state_dim,
-        x.dtype,
-        eps=eps,
-        eps0=rule.eps0,
-        box=box,
-        boundary=boundary,
-        terms=rule.terms,
-        moving=not rule.static,
-        alpha=rule.alpha,
-        update_prob=update_prob,
-        dt=dt,
-        position_noise=position_noise,
-    )
+    options = {"eps": None, "terms": terms, "moving": not static, "alpha": alpha} | options
+    return make_physics(space_dim, state_dim, x.dtype, eps0=eps0, **options)
 
 
 def _check_rule_of_one_species(rule: NPARule) -> None:
@@ -303,29 +297,15 @@ def run_rules(
     return_path_length: bool = False,
 ) -> Particles:
     """Check the options of a rollout and run it; path lengths are None unless asked for."""
-    steps = checked_count("steps", steps)
-    if keep_every is not None:
-        keep_every = checked_count("keep_every", keep_every)
-        if keep_every == 0 or steps == 0 or steps % keep_every:
-            raise NPAError(
-                f"steps must be a multiple of keep_every, got {steps} and {keep_every}: the last "
-                f"world kept is the one at the end"
-            )
-    checked_choice("memory", memory, get_args(Memory))
+    options = steps, constants, detach_positions, memory, keep_every, per_species, world_by_world
+    spec = _checked_spec(*options)
+    if species:
+        # Not by `_replace`, which torch.compile cannot trace.
+        spec = RolloutSpec(*spec[:5], tuple(species), *spec[6:])
     checked_choice("cuda_graph", cuda_graph, CUDA_GRAPH_CHOICES)
-    detach_positions = checked_flag("detach_positions", detach_positions)
     check_generator(generator, worlds.x.device, worlds.x.shape[0])
     after = execute(
-        RolloutSpec(
-            steps,
-            constants,
-            detach_positions,
-            memory,
-            keep_every,
-            tuple(species),
-            per_species,
-            world_by_world,
-        ),
+        spec,
         rules,
         worlds.with_fields(goal=None),
         generator,
@@ -335,3 +315,26 @@ def run_rules(
     )
     path_length = after.path_length if return_path_length else None
     return after.with_fields(path_length=path_length, goal=worlds.goal)
+
+
+@checked_once
+def _checked_spec(
+    steps: int,
+    constants: Physics,
+    detach_positions: bool,
+    memory: Memory,
+    keep_every: int | None,
+    *of_species: bool,
+) -> RolloutSpec:
+    """Return the options of a rollout of one species after checking them."""
+    steps = checked_count("steps", steps)
+    if keep_every is not None:
+        keep_every = checked_count("keep_every", keep_every)
+        if keep_every == 0 or steps == 0 or steps % keep_every:
+            raise NPAError(
+                f"steps must be a multiple of keep_every, got {steps} and {keep_every}: the last "
+                f"world kept is the one at the end"
+            )
+    checked_choice("memory", memory, get_args(Memory))
+    detached = checked_flag("detach_positions", detach_positions)
+    return RolloutSpec(steps, constants, detached, memory, keep_every, (), *of_species)

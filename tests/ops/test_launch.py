@@ -3,6 +3,7 @@
 import collections
 import subprocess
 import sys
+import threading
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest
@@ -146,6 +147,22 @@ def test_threads_and_modes_repeat_on_their_own(device):
     with ThreadPoolExecutor(3) as pool:
         for done in [pool.submit(work) for _ in range(3)]:
             done.result()
+    with torch.autograd.set_multithreading_enabled(False):
+        for _ in range(4):
+            assert_same(perceived(x, s), expected)
+
+
+def test_a_check_of_positions_waits_for_late_reports(monkeypatch):
+    late, report = [], position_check.launch
+
+    def launch_later(*arguments):
+        threading.Timer(0.05, lambda: late.append(1) or report(*arguments)).start()
+
+    monkeypatch.setattr(position_check, "_is_slow", lambda x: False)
+    monkeypatch.setattr(position_check, "launch", launch_later)
+    with position_check.checked_positions(torch.zeros(1, 4, 2)):
+        assert not late
+    assert late
 
 
 @pytest.mark.parametrize("fast", [False, True])

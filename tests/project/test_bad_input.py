@@ -4,7 +4,7 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
-from support.refusals import calls
+from support.refusals import calls, refused
 
 import npa_envs
 from npa_envs import (
@@ -69,6 +69,22 @@ BEYOND, SMALL_BOX = r"eps must lie in .* for torch\.float32", r"at least 2 eps =
 def test_operators_name_what_they_reject(function, x, s, eps, box, message):
     with pytest.raises(NPAError, match=message):
         function(x, s, eps, box=box)
+
+
+def test_a_call_that_was_allowed_does_not_let_similar_ones_pass():
+    box, rule = [4.0, 4.0], NPARule()
+    for _ in range(2):
+        perceive(X, S, 1), perceive(X, S, 1.0, box=box), rollout(rule, X, S, 1, dt=1)
+        refused(NO_NUMBER, perceive, X, S, True)
+        refused("share dtype", perceive, X, S.double(), 1)
+        refused("agree in worlds", perceive, X, S[:, :3], 1)
+        refused("dense tensor", perceive, X, SPARSE, 1)
+        refused("dt must be a number", rollout, rule, X, S, 1, dt=True)
+        refused("must have the rule's", rollout, WIDE, X, S, 1)
+    box[0] = 1.0
+    refused("at least 2 eps", perceive, X, S, 1.0, box=box)
+    rule.to(torch.float64)
+    refused("the rule must share dtype", rollout, rule, X, S, 1, dt=1)
 
 
 @pytest.mark.parametrize("function", [perceive, perception_fields])
