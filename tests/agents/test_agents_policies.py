@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 from support.refusals import refused
+from support.slow import slow
 from support.small_envs import begun
 
 import npa_envs
@@ -119,7 +120,7 @@ def test_every_step_of_a_rules_episode_is_a_step_of_its_rollout(gecko, name, key
     policy = RulePolicy(rule, env)
     observation, x, s, random = seeded(env, 3)
     start = s
-    for _ in range(8 if name in WILD else 64):
+    for _ in range(8 if name in WILD else 24):
         env.step(policy(observation))
         x, s = rolled(rule, x, s, env, random)
         assert difference(env, x, s) < STEP_TOLERANCE
@@ -247,8 +248,13 @@ FORMS = {
 }
 
 
-@pytest.mark.parametrize("form", FORMS)
-@pytest.mark.parametrize("ending", [{}, {"success_loss": 0.9}])
+@pytest.mark.parametrize(
+    ("form", "ending"),
+    [
+        *((form, {"success_loss": 0.9}) for form in FORMS),
+        *(slow(form, {}) if form in ("sync", "async") else (form, {}) for form in FORMS),
+    ],
+)
 def test_episodes_are_the_same_in_every_form_of_an_environment(form, ending):
     keywords = {"particle_count": 32, "max_episode_steps": 40} | ending
     usual, seeds = make_vector(**keywords), [4, 1, 2, 7]

@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from support.refusals import refused
+from support.slow import slow
 
 from npa_envs.agents import RandomPolicy, ZeroPolicy
 from npa_envs.agents.comparison import single_run as one_run
@@ -340,7 +341,7 @@ def test_an_interrupted_comparison_ends_its_processes_and_goes_on_where_it_was(
     assert not list(tmp_path.rglob(".seed*"))
 
 
-@pytest.mark.parametrize("learns", [False, True], ids=["that waits", "that learns"])
+@pytest.mark.parametrize("learns", [slow(False), True], ids=["that waits", "that learns"])
 def test_the_process_of_a_run_ends_with_the_comparison(tmp_path, learns):
     # With an order it would learn for ten minutes.
     request_of("mixing", "gradient", tmp_path, learning_seconds=600.0)

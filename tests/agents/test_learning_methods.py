@@ -8,6 +8,7 @@ import pytest
 import torch
 from support.learning_problems import digits, heart, progress_of, species, wild_rules
 from support.refusals import refused
+from support.slow import partly_slow
 
 import npa_envs
 from npa_envs.agents import (
@@ -139,7 +140,7 @@ LEARNED = {
 """Problems, what is left of the loss, how much more is returned, and by which method."""
 
 
-@pytest.mark.parametrize("case", LEARNED)
+@pytest.mark.parametrize("case", partly_slow(LEARNED, ("evolves", "parts", "mixes by SHAC")))
 def test_what_is_learned_leaves_a_share_of_the_loss_and_raises_the_return(case, device):
     problem, share, gain, options = LEARNED[case]
     first, last = run(problem, device=device, **options).log

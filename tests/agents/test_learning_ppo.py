@@ -10,6 +10,7 @@ import pytest
 import torch
 import torch.distributed as dist
 from support.learning_problems import heart, progress_of, wild_rules
+from support.slow import partly_slow
 
 from npa_envs.agents import RandomPolicy, evaluate_policy
 from npa_envs.agents.learning import Budget, Problem, RuleSet, ppo, train
@@ -50,7 +51,8 @@ FORMS = {
     "Stable-Baselines3": ("ppo_world", {}),
     "Stable-Baselines3, central critic": ("ppo_world", {"critic": "central"}),
 }
-EVERY_FORM = pytest.mark.parametrize("form", FORMS)
+TWICE = "device, by worlds", "Stable-Baselines3, central critic"
+EVERY_FORM = pytest.mark.parametrize("form", partly_slow(FORMS, TWICE))
 
 
 def learner(problem=HEART, **options):
@@ -351,8 +353,10 @@ def test_fine_tuning_does_not_undo_what_rules_can_do(form, taught):
     assert all(map(torch.equal, rules.parameters(), taught.parameters()))
 
 
-@pytest.mark.parametrize(("decay_share", "kept"), [(0.5, 4), (0.25, 6)])
-@EVERY_FORM
+@pytest.mark.parametrize(
+    ("form", "decay_share", "kept"),
+    [(form, *((0.5, 4), (0.25, 6))[k % 2]) for k, form in enumerate(FORMS)],
+)
 def test_in_every_form_the_noise_falls_towards_the_end(form, decay_share, kept, monkeypatch):
     left = [1.0]
     set_noise = GaussianRules.set_noise

@@ -178,15 +178,15 @@ sys.exit(main(["doctor"]))
 """
 
 
-def test_the_command_line_works_without_utf8(tmp_path):
-    program = "import sys; from npa_envs.cli import main; sys.exit(main(sys.argv[1:]))"
-    for words, shown in (
-        (["train", "texture", "--help"], "?"),
-        (["rollout", "gecko", "--steps", "8", "--out", str(tmp_path)], "growth.gif"),
-    ):
-        done = run_alone(program, *words, PYTHONUTF8="0", LC_ALL="C")
-        assert done.returncode == 0, done.stderr
-        assert shown in done.stdout
+def test_the_command_line_works_without_utf8(tmp_path, rule):
+    program = "import contextlib, sys; from npa_envs.cli import main\n"
+    program += "with contextlib.suppress(SystemExit): main(['train', 'texture', '--help'])\n"
+    program += "sys.exit(main(sys.argv[1:]))"
+    words = ["rollout", rule, "--steps", "8", "--out", str(tmp_path)]
+    done = run_alone(program, *words, PYTHONUTF8="0", LC_ALL="C")
+    assert done.returncode == 0, done.stderr
+    assert "?" in done.stdout
+    assert "growth.gif" in done.stdout
 
 
 def test_doctor_finds_packages_that_are_missing_or_old(monkeypatch):

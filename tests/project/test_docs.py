@@ -289,8 +289,8 @@ PROGRAMS = {
         "stable_baselines3",
     ),
     "learning: PPO": Program(
-        ("labels == ['ppo'] * 3 + ['ppo_world'] * 3",),
-        (("500_000", "1_000"),),
+        ("labels == ['ppo', 'ppo_world']",),
+        (("500_000", "1_000"), (r"range\(3\)", "range(1)")),
         slice(1, 2),
         "stable_baselines3",
     ),
@@ -318,7 +318,7 @@ PROGRAMS = {
             "sum(history[-8:]) < 0.8 * sum(history[:8])",
             "npa_envs.load_rule('ring.safetensors').state_dim == 12",
         ),
-        (("iterations = 400", "iterations = 40"),),
+        (("iterations = 400", "iterations = 40"), ("particle_count = 256", "particle_count = 96")),
     ),
     "own_task": Program(
         ("result.finished", "(folder / 'runs' / 'ring' / 'rule.safetensors').exists()"),

@@ -238,17 +238,24 @@ def test_clouds_are_cut_and_mutated_as_told():
 
 @pytest.fixture(scope="module")
 def trained(folder, tmp_path_factory):
-    """Return a rule that has learned three shapes in a few seconds."""
+    """Return a function that trains a rule to tell three shapes for some iterations."""
     fields = {"particle_count": 32, "hidden_dim": 32, "readout_hidden_dim": 16, "world_count": 16}
-    fields |= {"iterations": 250, "milestones": (200,), "steps": (5, 9)}
+    fields |= {"milestones": (200,), "steps": (5, 9), "picture_interval": 0}
     fields |= {"rotation": 10.0, "jitter": 0.005, "mutated_share": 0.3}
-    config = small_config(folder, tmp_path_factory.mktemp("run"), **fields)
-    return train(config, "point_classification", progress=False)
+
+    def train_for(iterations):
+        out = tmp_path_factory.mktemp("run")
+        config = small_config(folder, out, iterations=iterations, **fields)
+        return train(config, "point_classification", progress=False).folder
+
+    return train_for
 
 
+@pytest.mark.slow
 def test_particles_learn_to_say_what_they_form(trained):
-    rule = load_rule(trained.folder / "rule.safetensors")
-    config = json.loads((trained.folder / "config.json").read_text(encoding="utf-8"))
+    folder = trained(iterations=250)
+    rule = load_rule(folder / "rule.safetensors")
+    config = json.loads((folder / "config.json").read_text(encoding="utf-8"))
     task = PointClassification(PointClassificationConfig(**config["task"])).held_out()
     (row,) = accuracies(rule, task, checkpoints=(16,))
     assert row.majority >= 0.9
@@ -262,7 +269,7 @@ def test_particles_learn_to_say_what_they_form(trained):
 
 
 def test_the_commands_measure_and_film_a_rule_that_classifies(trained, tmp_path, capsys):
-    rule = str(trained.folder / "rule.safetensors")
+    rule = str(trained(iterations=2) / "rule.safetensors")
     figures = tmp_path / "figures.json"
     options = ["--checkpoints", "4", "8", "--json", str(figures), "--no-progress"]
     assert main(["evaluate", rule, *options]) == 0
