@@ -538,6 +538,7 @@ def test_demo_shows_growth_healing_and_training(tmp_path, monkeypatch, capsys):
     # A world that has hardly begun to grow: a frame for the seed, each step and each wound.
     monkeypatch.setattr(demo, "GROWING", ((4, 1),))
     monkeypatch.setattr(demo, "HEALING", ((4, 2),))
+    monkeypatch.setattr(demo, "SIDE", 256)
     words = ["demo", "--out", str(tmp_path), "--train-seconds", "1", "--no-progress"]
     assert main(words) == 0
     text = capsys.readouterr().out
@@ -547,7 +548,7 @@ def test_demo_shows_growth_healing_and_training(tmp_path, monkeypatch, capsys):
         verdict = r"(heals|heals but for a scar|does not heal) in 4 steps"
         assert re.search(rf"a {wound} {verdict}: .*{times}", text)
     with Image.open(tmp_path / "gecko.gif") as film:
-        assert film.size == (512, 512)
+        assert film.size == (256, 256)
         # There is no eye yet, so its wipe changes nothing, and equal frames become one.
         assert film.n_frames == 5 + (1 + 2) + 2
     assert (tmp_path / "report.txt").read_text(encoding="utf-8") in text
