@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 import torch
 from support.refusals import refused
-from support.slow import slow
 from support.small_envs import begun
 
 import npa_envs
@@ -248,15 +247,10 @@ FORMS = {
 }
 
 
-@pytest.mark.parametrize(
-    ("form", "ending"),
-    [
-        *((form, {"success_loss": 0.9}) for form in FORMS),
-        *(slow(form, {}) if form in ("sync", "async") else (form, {}) for form in FORMS),
-    ],
-)
-def test_episodes_are_the_same_in_every_form_of_an_environment(form, ending):
-    keywords = {"particle_count": 32, "max_episode_steps": 40} | ending
+@pytest.mark.parametrize("form", FORMS)
+def test_episodes_are_the_same_in_every_form_of_an_environment(form):
+    # Two of four worlds succeed.
+    keywords = {"particle_count": 32, "max_episode_steps": 40, "success_loss": 0.9}
     usual, seeds = make_vector(**keywords), [4, 1, 2, 7]
     expected = evaluate_policy(usual, PaintPolicy(usual), seeds)
     env = (make if form.startswith("single") else make_vector)(**keywords, **FORMS[form])
@@ -265,9 +259,9 @@ def test_episodes_are_the_same_in_every_form_of_an_environment(form, ending):
     found = evaluate_policy(env, policy, iter(seeds))
     env.close()
     assert found.endings == expected.endings
-    assert ("success" in found.endings) == bool(ending)
+    assert set(found.endings) == {"success", "time limit"}
     assert found.steps.tolist() == expected.steps.tolist()
-    assert len(set(found.steps.tolist() if ending else found.returns.tolist())) > 1
+    assert len(set(found.returns.tolist())) == 4
     for name in ("returns", "start_losses", "final_losses"):
         near = 1e-5 if "world" in form else 1e-6
         np.testing.assert_allclose(getattr(found, name), getattr(expected, name), atol=near)

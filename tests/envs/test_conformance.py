@@ -16,7 +16,7 @@ from gymnasium.wrappers import AddRenderObservation, GrayscaleObservation, Resiz
 from support import crowds, small_envs
 from support.refusals import refused
 from support.slow import slow
-from support.small_envs import IDS, SPECIAL, assert_batch_of_singles, assert_same, begun
+from support.small_envs import IDS, SPECIAL, assert_same, begun
 
 from npa_envs.envs import multispecies_v0
 from npa_envs.registration import ALL, CENTRAL, GARDENS, SIZES
@@ -125,26 +125,11 @@ class TestEveryEnvironment:
         [(case, "same-step") for case in CASES | SIZED]
         + [((case, "next-step") if case in IDS else slow(case, "next-step")) for case in CASES],
     )
-    def test_vector_equals_single_over_autoresets(self, mode, device):
-        keywords = {"max_episode_steps": 4, "device": str(device)}
-        if mode == "next-step":
-            keywords |= {"reward": "sparse"}
-        envs = self.make_vec(3, autoreset_mode=mode, **keywords)
-        if not self.is_species:
-            keywords |= {"episode_steps": 4}
-        singles = [self.make(**keywords) for _ in range(3)]
-        reasons, _ = assert_batch_of_singles(envs, singles, self.sampled(envs, 10), mode)
-        assert "time limit" in reasons
-
-    @pytest.mark.parametrize(
-        ("case", "mode"),
-        [(case, "next-step") for case in CASES]
-        + [((case, "same-step") if case in IDS else slow(case, "same-step")) for case in CASES],
-    )
-    def test_gymnasiums_own_batches_of_single_worlds_agree_in_all_that_they_return(self, mode):
+    def test_gymnasiums_own_batches_of_single_worlds_agree_in_all_they_return(self, mode, device):
         # Some worlds succeed in steps in which others go on.
         loss = float(self.make_vec(2).reset(seed=0)[1]["loss"].mean())
-        limits = {"max_episode_steps": 3, "success_loss": loss}
+        limits = {"max_episode_steps": 3, "success_loss": loss, "device": str(device)}
+        limits |= {"reward": "sparse"} if mode == "next-step" else {}
         ours = self.make_vec(2, autoreset_mode=mode, **limits)
         theirs = gymnasium.vector.SyncVectorEnv(
             [lambda: self.make(episode_steps=3, **limits)] * 2,

@@ -36,19 +36,19 @@ print("extras:", [name for name in unwanted if name in sys.modules])
 warp = sys.modules.get("warp")
 runtime = None if warp is None else sys.modules["warp._src.context"].runtime
 print("devices:", torch.cuda.is_initialized(), runtime)
-
 x, s = torch.rand(1, 9, 2), torch.rand(1, 9, 3, requires_grad=True)
 for _ in range(4):
     npa_envs.perceive(x, s, 0.5).sum().backward()
 print("torch's compiler:", "torch._dynamo" in sys.modules)
-
 import importlib.util, os, warnings
 warnings.simplefilter("error")
 # Gymnasium, where it was imported, hides pygame's banner as well.
 os.environ.pop("PYGAME_HIDE_SUPPORT_PROMPT", None)
+import gymnasium
+gymnasium.make("npa_envs:npa/Morphogenesis2D-v0", particle_count=8)
+gymnasium.make_vec("npa/Morphogenesis2D-v0", 2, "vector_entry_point")
 if importlib.util.find_spec("pygame"):
     npa_envs.render.Window("a world", 32).close()
-    assert "pygame" in sys.modules
 """
 
 HELP = """

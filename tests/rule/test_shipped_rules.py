@@ -66,9 +66,7 @@ def test_what_is_grown_lasts_and_the_classifier_is_right():
         assert changes["all mutated", 32]["majority"] >= 0.95
 
 
-GROWING = [
-    name for task in ("morphogenesis2d", "texture", "morphogenesis3d") for name in named(task)
-]
+GROWING = [n for task in ("morphogenesis2d", "texture", "morphogenesis3d") for n in named(task)]
 QUICK = named("morphogenesis2d")[0], named("texture")[0]
 
 

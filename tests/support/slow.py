@@ -5,7 +5,3 @@ import pytest
 
 def slow(*values):
     return pytest.param(*values, marks=pytest.mark.slow)
-
-
-def partly_slow(values, left_out):
-    return [slow(value) if value in left_out else value for value in values]

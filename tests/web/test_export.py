@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import json
 import re
 import subprocess
@@ -150,21 +149,16 @@ GRAFTED = {"gecko": "heart", "dots": "dots", "duck": "duck"}
 """A rule that may join the world of each rule; the second one is periodic, the last one 3D."""
 
 
-@pytest.fixture(scope="module")
-def grown(run, settings):
-    """A function that returns how a page's world grows, and the world, by its rule."""
-
-    @functools.cache
-    def grow(rule):
-        script = [{"type": "set", "name": "rule", "value": rule}, *[ADVANCE] * 4, PAUSE]
-        return script, live(run, settings, *script)
-
-    return grow
+@pytest.fixture(scope="module", params=GRAFTED)
+def grown(run, settings, request):
+    """A rule, how a page's world of it grows, and that world."""
+    script = [{"type": "set", "name": "rule", "value": request.param}, *[ADVANCE] * 4, PAUSE]
+    return request.param, script, live(run, settings, *script)
 
 
 @pytest.mark.parametrize("name", BRUSHES)
-@pytest.mark.parametrize("rule", GRAFTED)
-def test_brushes_of_a_page_are_those_of_the_viewer(run, settings, grown, rule, name):
+def test_brushes_of_a_page_are_those_of_the_viewer(run, settings, grown, name):
+    rule, script, before = grown
     message = {"type": "brush", "tool": name.split()[0], "at": [0.1, 0.0], "radius": 0.15}
     message |= {"strength": 0.4, "move": [0.0, 0.0], "rule": GRAFTED[rule]} | BRUSHES[name]
     if rule == "dots":
@@ -173,7 +167,6 @@ def test_brushes_of_a_page_are_those_of_the_viewer(run, settings, grown, rule, n
     if rule == "duck":
         vectors = {"at": [0.1, 0.0, 0.0], "move": [0.1, 0.2, -0.1], "source": [-0.1, 0.1, 0.1]}
         message |= vectors | {"view": [0.6, 0.0, 0.8], "radius": 0.5}
-    script, before = grown(rule)
     after = live(run, settings, *script, message)
     world = RuleWorld(rule, device=torch.device("cpu"), particle_count=len(before["species"]))
     x, s = (unpacked(before[field], getattr(world.particles, field).shape) for field in "xs")
