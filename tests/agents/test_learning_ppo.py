@@ -343,7 +343,7 @@ def taught():
     return train("gradient", HEART, budget, 0, curve_points=1, evaluation_seeds=SEEDS).rules
 
 
-@pytest.mark.parametrize("form", ["device", "Stable-Baselines3"])
+@pytest.mark.parametrize("form", ["device", slow("Stable-Baselines3")])
 def test_fine_tuning_does_not_undo_what_rules_can_do(form, taught):
     first, last = run(form, HEART, 6 * ROUND, start=taught).log
     assert first.mean_return > 0.5
