@@ -393,13 +393,13 @@ def checked_box(
         sides = tuple(checked_number("a side of box", side) for side in several)
     if len(sides) != space_dim:
         raise NPAError(f"box must have {space_dim} sides, got {len(sides)}: {shown(sides)}")
-    rule, hint, least = "positive", "", math.ulp(0.0)
-    if eps is not None:
-        rule = f"at least 2 eps = {2.0 * eps:g}"
-        hint = ": enlarge the box or perceive at a smaller eps"
-        # With a tolerance: a box of exactly 2 eps passes however both were rounded.
-        least = 2.0 * eps * (1.0 - 1e-10)
+    # With a tolerance: a box of exactly 2 eps passes however both were rounded.
+    least = math.ulp(0.0) if eps is None else 2.0 * eps * (1.0 - 1e-10)
     if not all(math.isfinite(side) and side >= least for side in sides):
+        rule, hint = "positive", ""
+        if eps is not None:
+            rule = f"at least 2 eps = {2.0 * eps:g}"
+            hint = ": enlarge the box or perceive at a smaller eps"
         raise NPAError(f"box sides must be finite and {rule}, got {shown(sides)}{hint}")
     largest = 1e-6 * torch.finfo(dtype).max
     if max(sides) > largest:

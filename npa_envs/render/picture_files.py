@@ -186,7 +186,7 @@ def write_filmstrip(
         if Path(path).suffix.lower() == ".webp":
             strip.save(temporary, format="WebP", quality=88, method=6)
         else:
-            strip.save(temporary, format="PNG", optimize=True)
+            strip.save(temporary, format="PNG")
 
 
 def check_rate(fps: float, *, highest: float = 1000) -> None:

@@ -119,7 +119,7 @@ def test_every_step_of_a_rules_episode_is_a_step_of_its_rollout(gecko, name, key
     policy = RulePolicy(rule, env)
     observation, x, s, random = seeded(env, 3)
     start = s
-    for _ in range(8 if name in WILD else 64):
+    for _ in range(8 if name in WILD else 24):
         env.step(policy(observation))
         x, s = rolled(rule, x, s, env, random)
         assert difference(env, x, s) < STEP_TOLERANCE
@@ -248,9 +248,9 @@ FORMS = {
 
 
 @pytest.mark.parametrize("form", FORMS)
-@pytest.mark.parametrize("ending", [{}, {"success_loss": 0.9}])
-def test_episodes_are_the_same_in_every_form_of_an_environment(form, ending):
-    keywords = {"particle_count": 32, "max_episode_steps": 40} | ending
+def test_episodes_are_the_same_in_every_form_of_an_environment(form):
+    # Two of four worlds succeed.
+    keywords = {"particle_count": 32, "max_episode_steps": 40, "success_loss": 0.9}
     usual, seeds = make_vector(**keywords), [4, 1, 2, 7]
     expected = evaluate_policy(usual, PaintPolicy(usual), seeds)
     env = (make if form.startswith("single") else make_vector)(**keywords, **FORMS[form])
@@ -259,9 +259,9 @@ def test_episodes_are_the_same_in_every_form_of_an_environment(form, ending):
     found = evaluate_policy(env, policy, iter(seeds))
     env.close()
     assert found.endings == expected.endings
-    assert ("success" in found.endings) == bool(ending)
+    assert set(found.endings) == {"success", "time limit"}
     assert found.steps.tolist() == expected.steps.tolist()
-    assert len(set(found.steps.tolist() if ending else found.returns.tolist())) > 1
+    assert len(set(found.returns.tolist())) == 4
     for name in ("returns", "start_losses", "final_losses"):
         near = 1e-5 if "world" in form else 1e-6
         np.testing.assert_allclose(getattr(found, name), getattr(expected, name), atol=near)

@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from support.refusals import refused
+from support.slow import slow
 
 from npa_envs.agents import RandomPolicy, ZeroPolicy
 from npa_envs.agents.comparison import single_run as one_run
@@ -340,7 +341,7 @@ def test_an_interrupted_comparison_ends_its_processes_and_goes_on_where_it_was(
     assert not list(tmp_path.rglob(".seed*"))
 
 
-@pytest.mark.parametrize("learns", [False, True], ids=["that waits", "that learns"])
+@pytest.mark.parametrize("learns", [slow(False), True], ids=["that waits", "that learns"])
 def test_the_process_of_a_run_ends_with_the_comparison(tmp_path, learns):
     # With an order it would learn for ten minutes.
     request_of("mixing", "gradient", tmp_path, learning_seconds=600.0)
@@ -503,7 +504,7 @@ def quick_words(methods: str, particle_steps: int, options: str) -> list[str]:
 
 def test_a_quick_comparison_stops_goes_on_and_refuses_other_settings(tmp_path, capsys):
     pytest.importorskip("cma")
-    words = quick_words("zero evolution", 20_000, f"population=4 --commit test --out {tmp_path}")
+    words = quick_words("zero evolution", 5_000, f"population=4 --commit test --out {tmp_path}")
     assert main([*words, "--max-seconds", "1e-3"]) == 0
     assert "1 runs are left: call again" in capsys.readouterr().out
     folder = tmp_path / "particle-steps" / "morphogenesis2d"
@@ -517,7 +518,7 @@ def test_a_quick_comparison_stops_goes_on_and_refuses_other_settings(tmp_path, c
     folder /= "evolution/seed-0"
     content = json.loads((folder / "run.json").read_text(encoding="utf-8"))
     assert (content["status"], len(content["returns"])) == ("done", 4)
-    assert content["curve"][-1]["particle_steps"] >= 20000
+    assert content["curve"][-1]["particle_steps"] >= 5000
     assert str(tmp_path) not in json.dumps(content)
     assert "--out OUT" in content["command"]
     assert len(list(RuleSet.load(folder, make_problem("morphogenesis2d", quick=True)))) == 1

@@ -8,6 +8,7 @@ import pytest
 import torch
 from support.learning_problems import digits, heart, progress_of, species, wild_rules
 from support.refusals import refused
+from support.slow import slow
 
 import npa_envs
 from npa_envs.agents import (
@@ -137,9 +138,10 @@ LEARNED = {
     "evolves": (EVOLVING, 1.0, 0.2, EVOLUTION),
 }
 """Problems, what is left of the loss, how much more is returned, and by which method."""
+TWICE = "evolves", "parts", "mixes by SHAC"
 
 
-@pytest.mark.parametrize("case", LEARNED)
+@pytest.mark.parametrize("case", [slow(c) if c in TWICE else c for c in LEARNED])
 def test_what_is_learned_leaves_a_share_of_the_loss_and_raises_the_return(case, device):
     problem, share, gain, options = LEARNED[case]
     first, last = run(problem, device=device, **options).log

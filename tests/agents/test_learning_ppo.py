@@ -10,6 +10,7 @@ import pytest
 import torch
 import torch.distributed as dist
 from support.learning_problems import heart, progress_of, wild_rules
+from support.slow import slow
 
 from npa_envs.agents import RandomPolicy, evaluate_policy
 from npa_envs.agents.learning import Budget, Problem, RuleSet, ppo, train
@@ -50,7 +51,8 @@ FORMS = {
     "Stable-Baselines3": ("ppo_world", {}),
     "Stable-Baselines3, central critic": ("ppo_world", {"critic": "central"}),
 }
-EVERY_FORM = pytest.mark.parametrize("form", FORMS)
+TWICE = "device, by worlds", "Stable-Baselines3, central critic"
+EVERY_FORM = pytest.mark.parametrize("form", [slow(f) if f in TWICE else f for f in FORMS])
 
 
 def learner(problem=HEART, **options):
@@ -341,7 +343,7 @@ def taught():
     return train("gradient", HEART, budget, 0, curve_points=1, evaluation_seeds=SEEDS).rules
 
 
-@pytest.mark.parametrize("form", ["device", "Stable-Baselines3"])
+@pytest.mark.parametrize("form", ["device", slow("Stable-Baselines3")])
 def test_fine_tuning_does_not_undo_what_rules_can_do(form, taught):
     first, last = run(form, HEART, 6 * ROUND, start=taught).log
     assert first.mean_return > 0.5
@@ -351,10 +353,9 @@ def test_fine_tuning_does_not_undo_what_rules_can_do(form, taught):
     assert all(map(torch.equal, rules.parameters(), taught.parameters()))
 
 
-@pytest.mark.parametrize(("decay_share", "kept"), [(0.5, 4), (0.25, 6)])
-@EVERY_FORM
-def test_in_every_form_the_noise_falls_towards_the_end(form, decay_share, kept, monkeypatch):
-    left = [1.0]
+@pytest.mark.parametrize(("form", "kept"), zip(FORMS, (4, 6, 4, 6), strict=True))
+def test_in_every_form_the_noise_falls_towards_the_end(form, kept, monkeypatch):
+    left, decay_share = [1.0], 1.0 - kept / 8
     set_noise = GaussianRules.set_noise
 
     def spy(actor, share):

@@ -4,6 +4,7 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
+from support.slow import slow
 
 from npa_envs import NPAError
 from npa_envs.agents import NetworkPolicy, evaluate_policy, load_policy, shipped_policies
@@ -13,7 +14,7 @@ SEEDS = range(3_000_000, 3_000_016)
 SMALL = [id for id in shipped_policies() if "Small" in id]
 
 
-@pytest.mark.parametrize("id", SMALL)
+@pytest.mark.parametrize("id", [n if "Central" in n else slow(n) for n in SMALL])
 def test_shipped_policies_do_better_than_nobody_in_episodes_of_other_seeds(id):
     envs = gymnasium.make_vec(id, num_envs=len(SEEDS))
     shipped, nobody = (

@@ -7,11 +7,13 @@ from dataclasses import fields, replace
 
 import pytest
 from PIL import Image
+from support.slow import slow
 from support.small_digits import write_idx
 
 from npa_envs.cli import final_report as report
 from npa_envs.cli import main
 from npa_envs.errors import MissingDependencyError
+from npa_envs.measure import quality
 from npa_envs.measure.quality import AccuracyRow, EvaluationRow, HealingRow, PictureRow
 from npa_envs.measure.wounds import WoundRow
 from npa_envs.render import world_film
@@ -25,6 +27,8 @@ def short(monkeypatch):
     monkeypatch.setattr(report, "CHECKPOINTS", (8, 128))
     monkeypatch.setattr(report, "CLOUD_CHECKPOINTS", (8, 32))
     monkeypatch.setattr(report, "FILM_STEPS", 6)
+    for name in ("grow_steps", "heal_steps"):
+        monkeypatch.setitem(quality.healing.__wrapped__.__kwdefaults__, name, 16)
 
 
 def words_of(task, folder):
@@ -108,7 +112,7 @@ def test_a_report_without_ffmpeg_has_all_but_the_film_that_needs_it(tmp_path, ca
     assert files == {"rule.md", "rule.json", "rule.gif", "rule-filmstrip.png", "rule-target.png"}
 
 
-@pytest.mark.parametrize(("factor", "holds"), [(1.0, True), (10.0, False), (math.nan, False)])
+@pytest.mark.parametrize(("factor", "holds"), [(1.0, True), (10.0, False), slow(math.nan, False)])
 def test_a_report_says_where_worlds_do_not_hold(factor, holds, tmp_path, capsys, monkeypatch):
     measure = report.tables_of
 

@@ -9,6 +9,7 @@ import pytest
 import torch
 import warp as wp
 from support.processes import on_ranks
+from support.slow import slow
 
 import npa_envs
 from npa_envs.kernels import native_functions as native
@@ -74,7 +75,12 @@ VARIANTS = {
 }
 
 
-@pytest.mark.parametrize("name", VARIANTS)
+SECOND = ("sort 2D", "density 3D", "perceive", "adjoint 2D", "vectors", "steering 3D")
+SECOND += ("network without masks", "errors in float32", "whole rollouts")
+"""Other forms of kernels of which one is compiled all the same."""
+
+
+@pytest.mark.parametrize("name", [slow(n) if n in SECOND else n for n in VARIANTS])
 def test_cuda_kernels_compile(name, tmp_path):
     wp.init()
     if not wp.get_cuda_supported_archs():

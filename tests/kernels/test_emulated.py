@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from support.slow import slow
 from support.worlds import relative_error
 
 import npa_envs
@@ -73,7 +74,7 @@ def fourfold(number):
 @pytest.mark.parametrize(
     ("form", "count"),
     [
-        (VectorSizes(2, 32, 17, 8, chiral=True), 37),
+        slow(VectorSizes(2, 32, 17, 8, chiral=True), 37),
         (VectorSizes(3, 10, 6, 5, chiral=False), 23),
         (VectorSizes(2, 6, 3, 33, chiral=True), 9),
     ],
@@ -163,11 +164,11 @@ def exact_rollout(x, s, rule, masks, noise, side):
 @pytest.mark.parametrize(
     ("particles", "channels", "warps", "groups", "moment_inverse", "side"),
     [
-        pytest.param(60, 16, 1, 3, "threshold", None, marks=pytest.mark.slow),
-        pytest.param(100, 5, 2, 1, "smooth", None, marks=pytest.mark.slow),
+        slow(60, 16, 1, 3, "threshold", None),
+        slow(100, 5, 2, 1, "smooth", None),
         (200, 16, 4, 1, "threshold", 0.3),
-        pytest.param(128, 16, 8, 1, "threshold", None, marks=pytest.mark.slow),
-        pytest.param(400, 8, 8, 1, "threshold", None, marks=pytest.mark.slow),
+        slow(128, 16, 8, 1, "threshold", None),
+        slow(400, 8, 8, 1, "threshold", None),
     ],
 )
 def test_whole_rollouts_are_those_of_the_reference(

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from support.slow import slow
 
 from npa_envs.cli import main
 from npa_envs.cli.common import named_rules
@@ -233,7 +234,7 @@ def test_a_rule_that_blows_up_is_found_out(factor, count, verdict, device, monke
     "fields",
     [
         {"equivariant": True},
-        {"targets": ("ring", "heart"), "code_dim": 3},
+        slow({"targets": ("ring", "heart"), "code_dim": 3}),
         {"targets": ("ring", "heart"), "code_dim": 3, "encoder": True},
         {"division": True},
     ],

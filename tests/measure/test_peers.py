@@ -9,6 +9,7 @@ import pytest
 import torch
 from drift import relative_error
 from hash_grid import grid_fields
+from support.slow import slow
 
 from npa_envs import reference
 from npa_envs.measure.speed.timing import Workload
@@ -20,7 +21,7 @@ ERROR = 2e-6
 """Relative error that float32 may have; the worst measured is 3.6e-7."""
 
 
-@pytest.mark.parametrize("space_dim", [2, 3])
+@pytest.mark.parametrize("space_dim", [slow(2), 3])
 def test_peers_agree_with_the_library_in_float64_forward_and_backward(space_dim):
     left_out: dict[str, str] = {}
     cpu = torch.device("cpu")

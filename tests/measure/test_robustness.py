@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from support.slow import slow
 
 from npa_envs.cli import main
 from npa_envs.measure.accuracy.trained_rule_checks import task_name
@@ -225,7 +226,7 @@ def test_where_a_rule_works_follows_from_the_mean_loss_of_its_seeds(
 # Measuring
 
 
-@pytest.mark.parametrize("name", ["heart", "dots", "digits"])
+@pytest.mark.parametrize("name", ["heart", slow("dots"), "digits"])
 def test_damaged_worlds_go_beside_twins_with_the_same_masks(name, device):
     trial = trial_of(name, device)
     grown, trained = report.grow(trial)

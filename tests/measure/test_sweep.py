@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 import sweep
 from support.clock import wait_until
+from support.slow import slow
 from sweep import combinations, main
 
 from npa_envs.errors import NPAError
@@ -142,7 +143,7 @@ def in_a_terminal(tmp_path):
 
 @pytest.mark.parametrize(
     ("send", "number"),
-    [(os.killpg, signal.SIGINT), (os.kill, signal.SIGTERM), (os.kill, signal.SIGHUP)],
+    [(os.killpg, signal.SIGINT), slow(os.kill, signal.SIGTERM), (os.kill, signal.SIGHUP)],
     ids=["ctrl-c", "SIGTERM", "SIGHUP"],
 )
 def test_a_sweep_that_is_stopped_lets_its_runs_save_what_they_have(tmp_path, send, number):

@@ -10,6 +10,7 @@ from dataclasses import replace
 import pytest
 import torch
 from support.refusals import refused
+from support.slow import slow
 from support.worlds import assert_same, random_world, tensors
 from support.worlds import lively_rule as made_rule
 from torch.autograd import forward_ad
@@ -264,7 +265,7 @@ def test_results_are_the_same_bits_for_every_number_of_threads(name, world_count
         torch.set_num_threads(default)
 
 
-@pytest.mark.parametrize("name", ["perception", "a rollout", "a picture", "a mean"])
+@pytest.mark.parametrize("name", ["perception", slow("a rollout"), "a picture", "a mean"])
 def test_compiled_functions_reject_tangents(name, device):
     x, s = world(device)
     torch.compiler.reset()

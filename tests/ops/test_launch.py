@@ -1,8 +1,6 @@
 """Launches: tensors of any strides and sizes, one after the other, are described as they are."""
 
 import collections
-import subprocess
-import sys
 import threading
 from concurrent.futures import ThreadPoolExecutor
 
@@ -92,19 +90,6 @@ def test_repeated_launches_have_the_results_of_the_first(
     # With and without gradients, backward and fields, of two sizes; threads have their own.
     # On CUDA float64 is sorted with the help of torch's sums, so only backward passes are repeated.
     assert len(repeats) >= (2 if dtype == torch.float64 and device.type == "cuda" else 8)
-
-
-LOOP = """
-import sys, torch, npa_envs
-x, s = torch.rand(1, 9, 2), torch.rand(1, 9, 3, requires_grad=True)
-for _ in range(4):
-    npa_envs.perceive(x, s, 0.5).sum().backward()
-print("torch._dynamo" in sys.modules)
-"""
-
-
-def test_a_loop_does_not_wait_for_the_compiler_of_torch_to_be_imported():
-    assert subprocess.check_output([sys.executable, "-c", LOOP], text=True).endswith("False\n")
 
 
 @pytest.mark.usefixtures("nothing_repeated")

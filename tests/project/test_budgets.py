@@ -45,10 +45,14 @@ def trees() -> dict[Path, ast.Module]:
     return {path: ast.parse(path.read_text("utf-8")) for path in files(*PACKAGES)}
 
 
+@functools.cache
+def walked() -> list[tuple[Path, ast.AST]]:
+    return [(path, node) for path, tree in trees().items() for node in ast.walk(tree)]
+
+
 def nodes(cls: type[Node]) -> Iterator[tuple[Path, Node]]:
     """Yield all nodes of a class, with their files."""
-    for path, tree in trees().items():
-        yield from ((path, node) for node in ast.walk(tree) if isinstance(node, cls))
+    return ((path, node) for path, node in walked() if isinstance(node, cls))
 
 
 def functions_of_x_and_s() -> int:
@@ -105,13 +109,14 @@ def classes_named_twice() -> int:
 def places_that_draw_masks() -> int:
     """Count functions that draw update masks: ones with a probability."""
     home = {"randomness.py", "random_numbers.py"}
+    drawing = {path for path in trees() if "bernoulli" in path.read_text("utf-8")}
     return sum(
         any(
             isinstance(n, ast.Attribute) and n.attr in ("bernoulli", "bernoulli_")
             for n in ast.walk(function)
         )
         for path, function in nodes(ast.FunctionDef)
-        if path.name not in home
+        if path in drawing and path.name not in home
     )
 
 

@@ -311,7 +311,7 @@ PROGRAMS = {
             "sum(history[-8:]) < 0.8 * sum(history[:8])",
             "npa_envs.load_rule('ring.safetensors').state_dim == 12",
         ),
-        (("iterations = 400", "iterations = 40"),),
+        (("iterations = 400", "iterations = 40"), ("particle_count = 256", "particle_count = 96")),
     ),
     "own_task": Program(
         ("result.finished", "(folder / 'runs' / 'ring' / 'rule.safetensors').exists()"),

@@ -93,6 +93,7 @@ def test_wheel_holds_every_source_file_the_rules_and_the_license(site: Path) -> 
     assert license_file.read_bytes() == (ROOT / "LICENSE").read_bytes()
 
 
+@pytest.mark.slow
 def test_the_notebooks_run_with_no_more_than_the_wheel(site: Path, tmp_path: Path) -> None:
     command = [sys.executable, "-c", RUN_NOTEBOOKS, site, Path(__file__).parent / NOTEBOOK_TESTS]
     variables = os.environ | {"PYTHONPATH": str(site), "OMP_NUM_THREADS": "1"}

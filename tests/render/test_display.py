@@ -4,7 +4,6 @@ import base64
 import io
 import os
 import re
-import subprocess
 import sys
 import time
 import warnings
@@ -190,18 +189,3 @@ def test_without_a_screen_it_warns_once_and_does_nothing(monkeypatch, driver):
         assert not window.closed
         window.close()
         window.close()
-
-
-def test_pygame_starts_with_the_first_window_and_without_a_banner():
-    pytest.importorskip("pygame")
-    code = (
-        "import os, sys, npa_envs.render as render\n"
-        # Gymnasium, where it was imported, hides the banner as well.
-        "os.environ.pop('PYGAME_HIDE_SUPPORT_PROMPT', None)\n"
-        "assert 'pygame' not in sys.modules\n"
-        "render.Window('a world', 32).close()\n"
-        "assert 'pygame' in sys.modules\n"
-    )
-    environment = {**os.environ, "SDL_VIDEODRIVER": "dummy"}
-    command = [sys.executable, "-W", "error", "-c", code]
-    assert subprocess.check_output(command, env=environment) == b""

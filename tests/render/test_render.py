@@ -3,8 +3,6 @@
 import io
 import math
 import os
-import subprocess
-import sys
 from functools import partial
 from pathlib import Path
 
@@ -13,6 +11,7 @@ import pytest
 import torch
 from PIL import Image, ImageSequence
 from support.refusals import calls
+from support.training_runs import full_disk
 
 from npa_envs.errors import NPAError
 from npa_envs.render import (
@@ -183,32 +182,14 @@ def test_filmstrip_writes_a_caption_below_each_frame_and_none_beside_it(tmp_path
     assert (small[24] == 0)[8:pitch].sum() == 32
 
 
-FILE_SIZE_LIMIT = """
-import resource, sys
-import numpy as np
-from npa_envs.errors import NPAError
-from npa_envs.render import picture_files as film
-noise = np.random.default_rng(0).integers(0, 256, (6, 128, 128, 3), dtype=np.uint8)
-resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))
-for writer, path in zip(sys.argv[1::2], sys.argv[2::2]):
-    try:
-        getattr(film, writer)(path, noise)
-    except NPAError as error:
-        print("refused:", error)
-"""
-
-
-@pytest.mark.skipif(sys.platform == "win32", reason="needs a limit on the size of files")
 def test_disk_that_fills_up_is_a_clear_error_and_keeps_the_old_file(tmp_path):
-    words = [word for writer, name in WRITERS for word in (writer.__name__, str(tmp_path / name))]
-    for path in words[1::2]:
-        Path(path).write_bytes(b"old")
-    program = [sys.executable, "-c", FILE_SIZE_LIMIT, *words]
-    _, *messages = subprocess.check_output(program, text=True, encoding="utf-8").split("refused: ")
-    assert len(messages) == len(WRITERS)
-    for text, path in zip(messages, words[1::2], strict=True):
-        assert text.startswith(f"cannot write '{path}'")
-        assert Path(path).read_bytes() == b"old"
+    noise = np.random.default_rng(0).integers(0, 256, (6, 128, 128, 3), dtype=np.uint8)
+    for write, name in WRITERS:
+        path = tmp_path / name
+        path.write_bytes(b"old")
+        with full_disk(20_000), pytest.raises(NPAError, match=f"^cannot write '{path}'"):
+            write(path, noise)
+        assert path.read_bytes() == b"old"
     assert sorted(os.listdir(tmp_path)) == sorted(name for _, name in WRITERS)
 
 

@@ -4,6 +4,7 @@ import json
 
 import pytest
 import torch
+from support.slow import slow
 from support.training_runs import lively_rule, log_of, worlds_of
 
 from npa_envs.cli import main
@@ -209,11 +210,11 @@ def test_tiny_preset_learns(tiny, name):
 
 RESUMED = [
     *((name, {"dtype": "float64"}) for name in NAMES),
-    ("morphogenesis2d", {"memory": "recompute"}),
-    ("morphogenesis2d", {"memory": "minimal"}),
+    slow("morphogenesis2d", {"memory": "recompute"}),
+    slow("morphogenesis2d", {"memory": "minimal"}),
     ("morphogenesis2d", {"targets": ("heart", "ring"), "code_dim": 3, "particle_count": 48}),
     ("morphogenesis2d", {"division": True, "particle_count": 32, "steps": (8, 9)}),
-    ("morphogenesis2d", {"equivariant": True}),
+    slow("morphogenesis2d", {"equivariant": True}),
     pytest.param(
         "morphogenesis2d",
         {"device": "cuda", "steps": (8, 11), "iterations": 8},
@@ -224,7 +225,7 @@ RESUMED = [
 
 @pytest.mark.parametrize(("name", "fields"), RESUMED)
 def test_resumed_run_is_bit_identical(tiny, name, fields):
-    fields = {"iterations": 4, "log_interval": 2, "milestones": (), **fields}
+    fields = {"iterations": 4, "log_interval": 2, "milestones": (), "picture_interval": 0, **fields}
     whole = train(tiny(name, "whole", **fields), name, progress=False)
     config = tiny(name, "broken", **fields)
     trainer = Trainer(task_of(name, config, config.device), config, task_name=name)

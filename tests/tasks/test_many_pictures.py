@@ -10,7 +10,7 @@ from support.training_runs import make_cycle
 from support.worlds import seeded
 
 import npa_envs
-from npa_envs.cli import main
+from npa_envs.cli import final_report, main
 from npa_envs.errors import NPAError
 from npa_envs.rule.files import load_rule
 from npa_envs.rule.picture_codes import Codes
@@ -134,7 +134,9 @@ def test_a_rule_that_is_kept_has_the_codes_of_its_own_encoder(tmp_path):
     assert torch.equal(load_rule(tmp_path / "rule.safetensors").codes.table, codes.table)
 
 
-def test_the_command_trains_and_evaluates_by_name(tmp_path, capsys):
+def test_the_command_trains_and_evaluates_by_name(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(final_report, "CHECKPOINTS", (8, 128))
+    monkeypatch.setattr(final_report, "FILM_STEPS", 6)
     out = str(tmp_path / "many")
     small = [f"--{name.replace('_', '-')}={value}" for name, value in SMALL.items()]
     words = ["--preset=tiny", *small, "--iterations=2", "--no-progress"]

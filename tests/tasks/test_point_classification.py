@@ -236,19 +236,19 @@ def test_clouds_are_cut_and_mutated_as_told():
     assert torch.equal(new_s.sort(1).values, s.sort(1).values)
 
 
-@pytest.fixture(scope="module")
-def trained(folder, tmp_path_factory):
-    """Return a rule that has learned three shapes in a few seconds."""
+def trained(folder, out, iterations):
+    """Train a rule to tell three shapes; return the run's folder."""
     fields = {"particle_count": 32, "hidden_dim": 32, "readout_hidden_dim": 16, "world_count": 16}
-    fields |= {"iterations": 250, "milestones": (200,), "steps": (5, 9)}
-    fields |= {"rotation": 10.0, "jitter": 0.005, "mutated_share": 0.3}
-    config = small_config(folder, tmp_path_factory.mktemp("run"), **fields)
-    return train(config, "point_classification", progress=False)
+    fields |= {"milestones": (200,), "steps": (5, 9), "picture_interval": 0}
+    fields |= {"rotation": 10.0, "jitter": 0.005, "mutated_share": 0.3, "iterations": iterations}
+    return train(small_config(folder, out, **fields), "point_classification", progress=False).folder
 
 
-def test_particles_learn_to_say_what_they_form(trained):
-    rule = load_rule(trained.folder / "rule.safetensors")
-    config = json.loads((trained.folder / "config.json").read_text(encoding="utf-8"))
+@pytest.mark.slow
+def test_particles_learn_to_say_what_they_form(folder, tmp_path):
+    run = trained(folder, tmp_path, 250)
+    rule = load_rule(run / "rule.safetensors")
+    config = json.loads((run / "config.json").read_text(encoding="utf-8"))
     task = PointClassification(PointClassificationConfig(**config["task"])).held_out()
     (row,) = accuracies(rule, task, checkpoints=(16,))
     assert row.majority >= 0.9
@@ -261,8 +261,8 @@ def test_particles_learn_to_say_what_they_form(trained):
         changes_of_mind(rule, task, steps=(0, 32, 16))
 
 
-def test_the_commands_measure_and_film_a_rule_that_classifies(trained, tmp_path, capsys):
-    rule = str(trained.folder / "rule.safetensors")
+def test_the_commands_measure_and_film_a_rule_that_classifies(folder, tmp_path, capsys):
+    rule = str(trained(folder, tmp_path / "run", 2) / "rule.safetensors")
     figures = tmp_path / "figures.json"
     options = ["--checkpoints", "4", "8", "--json", str(figures), "--no-progress"]
     assert main(["evaluate", rule, *options]) == 0

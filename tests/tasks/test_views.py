@@ -428,7 +428,7 @@ def textured_plate(pixels, wrap, low, high):
     return Mesh(corners, faces, white, uv[faces], np.zeros(2, np.int64), (texture,))
 
 
-def averaged_plate(mesh, cameras, rays=20):
+def averaged_plate(mesh, cameras, rays=14):
     """Return the expected picture of such a plate: means over rays² rays for each sample."""
     pixels, (low, high) = mesh.textures[0].pixels, (mesh.uv.min(), mesh.uv.max())
     motion, (fx, fy, cx, cy) = cameras.world_to_camera[0].double().numpy(), cameras.intrinsics

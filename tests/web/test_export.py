@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 import torch
 from support.page_worlds import SPECIES, TOLERANCE, WORLDS, example, packed, unpacked
+from support.slow import slow
 from torch import Tensor
 
 from npa_envs.cli import main
@@ -116,7 +117,7 @@ def crowds():
     return settings_of(*(page_rule(name, particle_count=2304) for name in rules)) | {"code": ";"}
 
 
-@pytest.mark.parametrize("rule", ["gecko", "dots", "duck"])
+@pytest.mark.parametrize("rule", ["gecko", slow("dots"), slow("duck")])
 def test_helpers_change_no_bit_of_a_world(run, crowds, rule):
     at = [0.0] * (3 if rule == "duck" else 2)
     graft = {"type": "brush", "tool": "graft", "at": at, "radius": 0.1, "strength": 1.0}
@@ -148,10 +149,16 @@ GRAFTED = {"gecko": "heart", "dots": "dots", "duck": "duck"}
 """A rule that may join the world of each rule; the second one is periodic, the last one 3D."""
 
 
+@pytest.fixture(scope="module", params=GRAFTED)
+def grown(run, settings, request):
+    """A rule, how a page's world of it grows, and that world."""
+    script = [{"type": "set", "name": "rule", "value": request.param}, *[ADVANCE] * 4, PAUSE]
+    return request.param, script, live(run, settings, *script)
+
+
 @pytest.mark.parametrize("name", BRUSHES)
-@pytest.mark.parametrize("rule", GRAFTED)
-def test_brushes_of_a_page_are_those_of_the_viewer(run, settings, rule, name):
-    script = [{"type": "set", "name": "rule", "value": rule}, *[ADVANCE] * 9, PAUSE]
+def test_brushes_of_a_page_are_those_of_the_viewer(run, settings, grown, name):
+    rule, script, before = grown
     message = {"type": "brush", "tool": name.split()[0], "at": [0.1, 0.0], "radius": 0.15}
     message |= {"strength": 0.4, "move": [0.0, 0.0], "rule": GRAFTED[rule]} | BRUSHES[name]
     if rule == "dots":
@@ -160,7 +167,6 @@ def test_brushes_of_a_page_are_those_of_the_viewer(run, settings, rule, name):
     if rule == "duck":
         vectors = {"at": [0.1, 0.0, 0.0], "move": [0.1, 0.2, -0.1], "source": [-0.1, 0.1, 0.1]}
         message |= vectors | {"view": [0.6, 0.0, 0.8], "radius": 0.5}
-    before = live(run, settings, *script)
     after = live(run, settings, *script, message)
     world = RuleWorld(rule, device=torch.device("cpu"), particle_count=len(before["species"]))
     x, s = (unpacked(before[field], getattr(world.particles, field).shape) for field in "xs")

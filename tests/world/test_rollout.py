@@ -5,6 +5,7 @@ import sys
 import numpy as np
 import pytest
 import torch
+from support.slow import slow
 from support.worlds import (
     assert_near,
     assert_same,
@@ -259,10 +260,10 @@ def test_a_rollout_of_no_steps_returns_worlds_of_its_own():
 @pytest.mark.parametrize(
     ("gradients", "static", "options"),
     [
-        (False, False, {}),
+        slow(False, False, {}),
         (True, False, {}),
-        (True, True, {}),
-        (True, False, {"memory": "minimal", "box": 1.5, "eps": 0.25}),
+        slow(True, True, {}),
+        slow(True, False, {"memory": "minimal", "box": 1.5, "eps": 0.25}),
     ],
     ids=("quiet", "stored", "static", "recomputed"),
 )
@@ -274,6 +275,8 @@ def test_a_rollout_compiled_for_all_sizes_is_a_rollout(gradients, static, option
         rule.eps0 = eps0
         return npa_envs.rollout(rule, x, s, 2, update_prob=1.0, **options)
 
+    # Otherwise what is compiled too often already runs as it is.
+    torch.compiler.reset()
     compiled = torch.compile(outcome, backend="aot_eager", dynamic=True)
     with torch.set_grad_enabled(gradients):
         for world_count, particle_count, eps0 in ((1, 20, 0.2), (2, 30, 0.2), (2, 30, 0.3)):
