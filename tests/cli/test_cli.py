@@ -446,6 +446,14 @@ def test_rollout_repeats_itself_and_makes_about_150_frames(tmp_path, rule):
         assert (film.size, film.n_frames) == ((16, 16), 152)
 
 
+def test_films_of_another_rule_go_to_another_folder_by_default(tmp_path, rule, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for source in (rule, "gecko"):
+        assert main(["rollout", source, "--steps", "2", "--resolution", "16", "--no-progress"]) == 0
+    films = {path.parent.name for path in tmp_path.glob("runs/rollout/*/growth.gif")}
+    assert films == {"ring", "gecko"}
+
+
 def test_a_film_has_the_style_and_the_background_that_were_asked_for(tmp_path, rule, capsys):
     words = ["rollout", rule, "--steps", "8", "--every", "4", "--no-progress"]
     large = ["--resolution", "96", "--background", "#102030"]
