@@ -74,8 +74,7 @@ def main(arguments: Sequence[str]) -> int:
         trained.task, options.rule, rule, device, least=SCREEN, resolution=options.resolution,
         points=options.style == "points", **options.world,
     )  # fmt: skip
-    out = options.out or Path("runs/rollout", rule_name(options.rule))
-    folder = common.writable_folder(out)
+    folder = common.writable_folder(options.out or Path("runs/rollout", rule_name(options.rule)))
     generator = torch.Generator(device).manual_seed(options.seed)
     seed_world = trained.task.seed(1, generator=generator, device=device)
     with stop_flag() as stop, common.progress_bar(options.steps, show=options.progress) as advance:

@@ -142,7 +142,8 @@ def test_list_names_tasks_presets_targets_and_losses(capsys):
     for part in ("rules", "targets", "ids", "presets"):
         assert main(["list", part]) == 0
         parts[part] = capsys.readouterr().out
-    assert "\n".join(parts.values()) == text.rpartition("\none part:")[0]
+    hint = "one part: npa-envs list rules|targets|ids|presets\n"
+    assert "\n".join([hint, *parts.values(), hint]) == text
     ids = re.findall(r"^  (npa/\S+) +\d+  \S", parts["ids"], re.MULTILINE)
     named = [entry.id for entry in (*registration.ALL, *registration.SPECIES_SIZES)]
     assert sorted(ids) == sorted([*named, *registration.SPECIES])
@@ -240,6 +241,7 @@ def test_doctor_names_old_cards_idle_cores_cold_caches_and_what_is_not_there(mon
     monkeypatch.setattr(sys, "platform", "linux")
     monkeypatch.delenv("DISPLAY", raising=False)
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    assert next(doctor._torch_devices()).text == "threads: 1, cores: 16"
     lines = [*doctor._torch_devices(), *doctor._kernel_cache(), *doctor._films_and_screen()]
     fixes = ["OMP_NUM_THREADS", "8.0", "npa-envs warmup", "pip install -U 'imageio", "ssh -L"]
     for line, mark, fix in zip(lines, "---!-", fixes, strict=True):
@@ -373,6 +375,15 @@ MISTAKES = [
     ("rollout gecko --seed -1", "seed must be in [0, 2^63), got -1"),
     ("rollout gecko --seed 9223372036854775808", "seed must be in"),
 ]
+
+
+def test_cures_are_spelled_as_one_types_them(trained, capsys, monkeypatch):
+    words = ["train", *TINY, "--milestones", "--resume", "--out", str(trained)]
+    cure = f"a new run in another folder, from this rule with --initial-rule '{trained}'"
+    assert cure in error_of(capsys, [*words, "--iterations", "9"])
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    message = error_of(capsys, ["evaluate", "gecko", "--device", "cuda"])
+    assert "sees 0 CUDA devices: leave out --device, or see" in message
 
 
 @pytest.mark.parametrize(("words", "message"), MISTAKES)
