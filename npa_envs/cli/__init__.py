@@ -79,6 +79,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
             return _dispatch(words)
     except NPAError as error:
         message = re.sub(r"make the environment with (?=\w+=)", "say --keywords ", str(error))
+        message = re.sub(r"\binitial_rule=(?=['\"])", "--initial-rule ", message)
+        message = message.replace("use device='cpu'", "leave out --device")
         print(f"npa-envs: error: {' '.join(message.split())}", file=sys.stderr)
         return ERROR
     except KeyboardInterrupt:

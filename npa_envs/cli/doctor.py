@@ -114,7 +114,7 @@ def _torch_devices() -> Iterator[DoctorLine]:
     cores, threads = os.cpu_count() or 1, torch.get_num_threads()
     idle = cores >= 4 and threads < cores // 2
     fix = "more is faster for large worlds: set OMP_NUM_THREADS, or leave it out" if idle else None
-    yield DoctorLine("cpu", f"{threads} threads of {cores} cores", fix, optional=True)
+    yield DoctorLine("cpu", f"threads: {threads}, cores: {cores}", fix, optional=True)
     if not torch.cuda.is_available():
         yield _no_cuda(torch.version.cuda)
         return

@@ -71,8 +71,9 @@ WORDS: Mapping[str, str] = {
     "extent": "longest side of the world [length units]; it grows where particles escape",
     "damage": "what is done to grown worlds: states set to zero in a disk, or a slit",
     "wounds": "places that are damaged, one in each copy of a world",
-    "changed": "wounds that raise the loss near them above the bound for healed ones",
-    "healed": "of these, wounds near which the loss is within the bound again",
+    "changed": "wounds that leave a mark: the loss near them rises by more than a quarter, and by "
+    "more than a tenth of the whole picture's loss",
+    "healed": "of these, wounds whose mark is gone",
     "scars": "parts of the body where wounds did not heal",
     "before": "loss before the damage; of wounds, near them",
     "after": "that right after the damage",
@@ -147,8 +148,11 @@ def write_report(
         for text, name in names.items()
         if (folder / f"{path.stem}-{name}.png").exists()
     )
-    write_text(model_card, _model_card(rule, task, task_name, training, facts, tables, pictures))
-    said = "".join(f"\n              {clause}" for clause in shortfalls(tables))
+    more = further_training(path, task_name, tables)
+    card = _model_card(rule, task, task_name, training, facts, tables, pictures, more)
+    write_text(model_card, card)
+    clauses = shortfalls(tables) + [f"train on: {more}"] * bool(more)
+    said = "".join(f"\n              {clause}" for clause in clauses)
     return model_card, score_line(json.loads(text)) + missing_films + said
 
 
@@ -203,13 +207,25 @@ def shortfalls(tables: Mapping[str, Sequence[Any]]) -> list[str]:
     for row in tables.get("healing", ()):
         if isinstance(row, WoundRow):
             healed, count = row.healed, row.changed
-            what = f"changed places keep a scar ({row.scars})"
+            kind, _, size = row.damage.partition(", ")
+            which = "it" if count == 1 else f"{count - healed} of these"
+            what = f"{count} of {row.wounds} {kind}s, {size}, left a mark, and {which} did not heal"
+            what += f" ({row.scars})"
         else:
-            healed, count, what = row.worlds_healed, row.world_count, "worlds do not heal"
+            healed, count = row.worlds_healed, row.world_count
+            what = f"after a {row.damage}, {count - healed} of {count} worlds do not heal"
         if healed < count:
             rise = f"the mean loss becomes {row.end / row.before:.1f} times that before"
-            clauses.append(f"after a {row.damage}, {count - healed} of {count} {what}; {rise}")
+            clauses.append(f"{what}; {rise}")
     return clauses
+
+
+def further_training(path: Path, task: str, tables: Mapping[str, Sequence[Any]]) -> str:
+    """Return the command that trains on a run's rule whose worlds fail unhurt; else ""."""
+    if path.name != "rule.safetensors" or not shortfalls({"growth": tables.get("growth", ())}):
+        return ""
+    run = shlex.quote(str(path.parent))
+    return f"npa-envs train {task} --config {run}/config.json --initial-rule {run} --out {run}2"
 
 
 def _model_card(
@@ -220,6 +236,7 @@ def _model_card(
     facts: Mapping[str, str],
     tables: Mapping[str, Sequence[Any]],
     pictures: str,
+    more: str,
 ) -> str:
     config = task.config
     goal = getattr(config, "data", config.goal_text)
@@ -251,6 +268,7 @@ def _model_card(
         "move of a step in ε, p: probability of an update.",
         "## What does not hold",
         "\n".join(failures) or "Nothing that was measured fails.",
+        f"To train on:\n\n```sh\n{more}\n```" if more else "",
         "## Training",
         f"Commit {facts['commit']}: {training}",
         "## Measured",

@@ -47,9 +47,8 @@ def main(arguments: Sequence[str]) -> int:
     """Print one or all parts of the list; return 0."""
     options = common.parse_options(ListOptions, "list", arguments)
     chosen = common.chosen_names("part", [options.part] if options.part else [], PARTS)
-    print("\n\n".join("\n".join(PARTS[part]()) for part in chosen))
-    if not options.part:
-        print(f"\none part: npa-envs list {'|'.join(PARTS)}")
+    hint = [] if options.part else [f"one part: npa-envs list {'|'.join(PARTS)}"]
+    print("\n\n".join([*hint, *("\n".join(PARTS[part]()) for part in chosen), *hint]))
     return 0
 
 

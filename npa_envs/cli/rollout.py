@@ -38,8 +38,8 @@ class RolloutOptions(common.RuleOptions):
     damage: Annotated[tuple[tuple[str, ...], ...], tyro.conf.UseAppendAction] = ()
     """Damage during the run, STEP:KIND or STEP:KIND:SIZE: 200:cut (gap 0.1), 300:wipe (radius 0.2),
     400:clump (radius 0.2); sizes in length units."""
-    out: Path = Path("runs/rollout")
-    """Folder to write to; created where missing."""
+    out: Path | None = None
+    """Folder to write to; created where missing; default: runs/rollout/NAME, of the rule or run."""
     resolution: int | None = None
     """Pixels on each side of the film; default: as trained, but at least 256."""
     style: Literal["splats", "points"] = "splats"
@@ -60,7 +60,7 @@ def main(arguments: Sequence[str]) -> int:
     import torch
 
     from npa_envs.render.world_film import SCREEN, WorldFilm, film_world, write_3d_world
-    from npa_envs.rule.files import load_rule
+    from npa_envs.rule.files import load_rule, rule_name
     from npa_envs.training.run_folder import stop_flag
     from npa_envs.training.task_of_rule import task_for_film, task_of_rule
 
@@ -74,7 +74,7 @@ def main(arguments: Sequence[str]) -> int:
         trained.task, options.rule, rule, device, least=SCREEN, resolution=options.resolution,
         points=options.style == "points", **options.world,
     )  # fmt: skip
-    folder = common.writable_folder(options.out)
+    folder = common.writable_folder(options.out or Path("runs/rollout", rule_name(options.rule)))
     generator = torch.Generator(device).manual_seed(options.seed)
     seed_world = trained.task.seed(1, generator=generator, device=device)
     with stop_flag() as stop, common.progress_bar(options.steps, show=options.progress) as advance:

@@ -84,17 +84,18 @@ class WoundRow:
     after: float | None
     end: float | None
     scars: str = ""
-    missing: ClassVar[str] = "unchanged"
+    missing: ClassVar[str] = "too small"
     """What tables show for None."""
 
     @property
     def summary(self) -> str:
         """What has healed, as text."""
-        if not self.changed:
-            return f"{self.damage}: none of {self.wounds} wounds changed the picture"
+        if self.changed:
+            marks = f"{self.changed} of {self.wounds} wounds left a mark"
+            return f"{self.damage}: {marks}, and {self.healed} of these healed"
         return (
-            f"{self.damage}: healed at {self.healed} of {self.changed} places that the wound "
-            f"changed; {self.changed} of {self.wounds} wounds changed the picture"
+            f"{self.damage}: too small to measure: none of {self.wounds} wounds raised the loss "
+            "near it above the bound, which rises with the rule's own loss"
         )
 
 

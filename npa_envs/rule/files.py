@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import mimetypes
 import os
 import warnings
 from collections.abc import Mapping, Sequence
@@ -258,9 +259,11 @@ def _locate(source: str | Path) -> tuple[Path, str | None]:
     if path.suffix in _SUFFIXES:
         return path, inner
     if os.path.exists(text):
+        is_picture = (mimetypes.guess_type(text, strict=False)[0] or "").startswith("image/")
+        cure = f"npa-envs train morphogenesis2d --target {shown(text)} trains a rule of it"
         raise NPAError(
-            f"a rule's file must end in {suffixes}, got {shown(text)}: rename it, or train a rule "
-            "of a picture by npa-envs train morphogenesis2d --target PICTURE"
+            f"a rule's file must end in {suffixes}, got {shown(text)}: "
+            f"{cure if is_picture else 'rename it'}"
         )
     if os.path.dirname(text):
         raise NPAError(f"cannot load a rule from {shown(text)}: it does not exist: check the path")
@@ -298,7 +301,7 @@ def read_tensors(
             weights = {name: file.get_tensor(name).clone() for name in names}
     except (OSError, ValueError, SafetensorError) as error:
         raise NPAError(
-            f"this is no safetensors file, or a truncated one ({shown(error)})"
+            f"no safetensors file, or a truncated one ({shown(error)}): download or copy it again"
         ) from error
     if header.get("format") != format_name:
         raise NPAError(

@@ -335,7 +335,7 @@ def _unpickle(data: bytes) -> Mapping[Any, Any]:
         # Torch raises exceptions of many kinds for damaged data.
         raise NPAError(
             "this is no state dict of tensors that torch reads without running code, or a "
-            f"truncated one ({shown(error)})"
+            "truncated one: download or copy it again"
         ) from error
     if not isinstance(state, Mapping):
         raise NPAError(f"the file must hold a state dict, got a {type(state).__name__}")

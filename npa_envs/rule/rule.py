@@ -180,6 +180,10 @@ class NPARule(nn.Module):
         self.codes = Codes(code_names, code_dim, encoder=encoder) if code_dim else None
         """The known codes, or None without `code_dim`."""
 
+    def extra_repr(self) -> str:
+        """Return what `print` shows before the layers."""
+        return f"state_dim={self.state_dim}, eps0={self.eps0:g}, alpha={self.alpha:g}"
+
     def _make_layers(self) -> None:
         self.hidden = nn.Linear(self.input_dim, self.hidden_dim)
         self.output = nn.Linear(self.hidden_dim, self.output_dim, bias=False)
@@ -450,9 +454,11 @@ class NPARule(nn.Module):
         """
         outputs = self.read_out(states)
         if outputs.shape[-1] < 3:
+            cure = "make the rule with state_dim=3 or more"
+            if states.shape[-1] < self.state_dim:
+                cure = f"give all {self.state_dim} channels"
             raise NPAError(
-                f"colours are the last three outputs of a particle, got {outputs.shape[-1]}: "
-                "make the rule with state_dim=3 or more"
+                f"colours are the last three outputs of a particle, got {outputs.shape[-1]}: {cure}"
             )
         return outputs[..., -3:] + COLOUR_OFFSET
 

@@ -109,8 +109,8 @@ def check_same_run(
         if name not in MAY_DIFFER and theirs.get(name) != ours.get(name)
     ]
     if differences:
-        rule = path.parent / "rule.safetensors"
-        start = f", from this rule with initial_rule={str(rule)!r}" if rule.is_file() else ""
+        written = (path.parent / "rule.safetensors").is_file()
+        start = f", from this rule with initial_rule={str(path.parent)!r}" if written else ""
         raise NPAError(
             f"the checkpoint {str(path)!r} is of another configuration ({'; '.join(differences)}): "
             f"resume with the configuration in {str(path.with_name('config.json'))!r}, or start a "

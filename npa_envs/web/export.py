@@ -140,10 +140,11 @@ def export_web(
 def distinct_names(sources: Sequence[str], what: str) -> list[str]:
     """Return the names of rules; raise NPAError, which begins with `what`, if two are equal."""
     names = [rule_name(source) for source in sources]
-    if not names or len(set(names)) < len(names):
+    twice = [name for name in names if names.count(name) > 1]
+    if not names or twice:
+        got = f"but {twice[0]} is named twice" if twice else "got none"
         raise NPAError(
-            f"{what} needs rules of different names, got {shown(names)}: leave one out, or give "
-            "its file another name"
+            f"{what} needs rules of different names, {got}: leave one out, or rename its file"
         )
     return names
 

@@ -142,7 +142,8 @@ def test_list_names_tasks_presets_targets_and_losses(capsys):
     for part in ("rules", "targets", "ids", "presets"):
         assert main(["list", part]) == 0
         parts[part] = capsys.readouterr().out
-    assert "\n".join(parts.values()) == text.rpartition("\none part:")[0]
+    hint = "one part: npa-envs list rules|targets|ids|presets\n"
+    assert "\n".join([hint, *parts.values(), hint]) == text
     ids = re.findall(r"^  (npa/\S+) +\d+  \S", parts["ids"], re.MULTILINE)
     named = [entry.id for entry in (*registration.ALL, *registration.SPECIES_SIZES)]
     assert sorted(ids) == sorted([*named, *registration.SPECIES])
@@ -240,6 +241,7 @@ def test_doctor_names_old_cards_idle_cores_cold_caches_and_what_is_not_there(mon
     monkeypatch.setattr(sys, "platform", "linux")
     monkeypatch.delenv("DISPLAY", raising=False)
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    assert next(doctor._torch_devices()).text == "threads: 1, cores: 16"
     lines = [*doctor._torch_devices(), *doctor._kernel_cache(), *doctor._films_and_screen()]
     fixes = ["OMP_NUM_THREADS", "8.0", "npa-envs warmup", "pip install -U 'imageio", "ssh -L"]
     for line, mark, fix in zip(lines, "---!-", fixes, strict=True):
@@ -375,6 +377,15 @@ MISTAKES = [
 ]
 
 
+def test_cures_are_spelled_as_one_types_them(trained, capsys, monkeypatch):
+    words = ["train", *TINY, "--milestones", "--resume", "--out", str(trained)]
+    cure = f"a new run in another folder, from this rule with --initial-rule '{trained}'"
+    assert cure in error_of(capsys, [*words, "--iterations", "9"])
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    message = error_of(capsys, ["evaluate", "gecko", "--device", "cuda"])
+    assert "sees 0 CUDA devices: leave out --device, or see" in message
+
+
 @pytest.mark.parametrize(("words", "message"), MISTAKES)
 def test_a_mistake_is_refused_and_nothing_is_written(
     words, message, rule, tmp_path, capsys, monkeypatch
@@ -444,6 +455,14 @@ def test_rollout_repeats_itself_and_makes_about_150_frames(tmp_path, rule):
     with Image.open(tmp_path / "growth.gif") as film:
         # One every second step, the last one, and one after the damage.
         assert (film.size, film.n_frames) == ((16, 16), 152)
+
+
+def test_films_of_another_rule_go_to_another_folder_by_default(tmp_path, rule, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for source in (rule, "gecko"):
+        assert main(["rollout", source, "--steps", "2", "--resolution", "16", "--no-progress"]) == 0
+    films = {path.parent.name for path in tmp_path.glob("runs/rollout/*/growth.gif")}
+    assert films == {"ring", "gecko"}
 
 
 def test_a_film_has_the_style_and_the_background_that_were_asked_for(tmp_path, rule, capsys):

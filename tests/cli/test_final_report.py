@@ -123,8 +123,17 @@ def test_a_report_says_where_worlds_do_not_hold(factor, holds, tmp_path, capsys,
 
     monkeypatch.setattr(report, "tables_of", measured)
     assert main(words_of("morphogenesis2d", tmp_path)) == 0
+    output = capsys.readouterr().out
     said = " unstable: at step 128 the loss is many times the least"
-    assert (said in capsys.readouterr().out) is not holds
+    assert (said in output) is not holds
+    commands = re.findall("train on: npa-envs (.*)", output)
+    card = (tmp_path / "run" / "report" / "rule.md").read_text("utf-8")
+    assert ("To train on:" in card) is bool(commands)
+    assert commands or holds
+    for command in commands:
+        assert f"npa-envs {command}\n" in card
+        assert main([*command.split(), "--no-progress", "--no-report"]) == 0
+        assert (tmp_path / "run2" / "rule.safetensors").exists()
 
 
 def test_a_rule_that_cannot_be_measured_is_kept_and_said_to_have_no_report(
@@ -149,11 +158,13 @@ def test_a_card_says_in_words_what_does_not_hold():
     wound = WoundRow("wipe, radius 0.2", 6, 5, 3, 0.1, 1.0, 0.3, scars="top left, bottom")
     whole = HealingRow("cut, gap 0.1", 0.1, 0.5, None, 6, 8, 0.2)
     assert report.shortfalls({"growth": growth, "healing": [wound, whole]}) == [
-        "after a wipe, radius 0.2, 2 of 5 changed places keep a scar (top left, bottom); the mean "
-        "loss becomes 3.0 times that before",
+        "5 of 6 wipes, radius 0.2, left a mark, and 2 of these did not heal (top left, bottom); "
+        "the mean loss becomes 3.0 times that before",
         "after a cut, gap 0.1, 2 of 8 worlds do not heal; the mean loss becomes 2.0 times that "
         "before",
     ]
+    lone = report.shortfalls({"healing": [replace(wound, changed=1, healed=0)]})
+    assert lone[0].startswith("1 of 6 wipes, radius 0.2, left a mark, and it did not heal (top")
     healed = replace(wound, healed=5)
     assert report.shortfalls({"growth": growth, "healing": [healed]}) == []
 

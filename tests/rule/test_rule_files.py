@@ -520,9 +520,20 @@ def test_truncated_files_are_refused(tmp_path, name):
         refused("cannot load a rule from", load_rule, f"{tmp_path / name}")
 
 
+def test_a_printed_rule_begins_with_what_calls_need():
+    first = repr(NPARule(state_dim=8, eps0=0.2)).split("\n")[1]
+    assert first == "  state_dim=8, eps0=0.2, alpha=0.5"
+
+
 def test_missing_files_and_folders_are_named(tmp_path, monkeypatch):
     (tmp_path / "rule.bin").touch()
-    refused(r"must end in \.safetensors, \.pth, \.pt, \.json", load_rule, tmp_path / "rule.bin")
+    known = r"must end in \.safetensors, \.pth, \.pt, \.json"
+    refused(f"{known}.*rule.bin': rename it", load_rule, tmp_path / "rule.bin")
+    (tmp_path / "house.png").touch()
+    train = r"house.png': npa-envs train morphogenesis2d --target '.*/house.png' trains a rule"
+    refused(f"{known}.*{train}", load_rule, tmp_path / "house.png")
+    (tmp_path / "broken.pth").write_bytes(b"e")
+    refused("truncated one: download or copy it again", load_rule, tmp_path / "broken.pth")
     for suffix in ("safetensors", "pth", "json"):
         path = tmp_path / f"rule.{suffix}"
         refused(f"rule.{suffix}.*does not exist: check", load_rule, path)

@@ -422,7 +422,7 @@ def test_bad_pages_are_rejected_before_any_work(tmp_path, monkeypatch):
         (["gecko"], "page.htm", r"must end in \.html"),
         (["gecko"], "nowhere/page.html", "does not exist"),
         ([], "page.html", "rules of different names"),
-        (["gecko", "gecko"], "page.html", "rules of different names"),
+        (["gecko", "gecko"], "page.html", "different names, but gecko is named twice"),
     ):
         with pytest.raises(NPAError, match=message):
             export_web(sources, tmp_path / path)
