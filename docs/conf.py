@@ -81,7 +81,7 @@ html_css_files = ["site.css"]
 html_extra_path = ["static/index.html"]
 html_show_sphinx = False
 html_favicon = "static/icon.svg"
-html_search_scorer = "static/search.js"
+html_search_scorer = str(Path(__file__).parent / "static/search.js")
 if (address := repository_address()) is not None:
     html_baseurl = names_of(address)["site"]
     html_theme_options = {
@@ -126,7 +126,7 @@ def add_summaries(app: Sphinx, name: str, *_: Any) -> None:
     said = {}
     for listing in LISTS[:2]:
         for page, text in SUMMARY.findall((ROOT / f"{listing}.md").read_text(encoding="utf-8")):
-            plain = re.sub(r"[`]|\[([^\]]+)\]\([^)]+\)", r"\1", text).strip()
+            plain = re.sub(r"[`]|\[([^\]]+)\]\([^)]+\)", r"\1", text).strip(" .")
             said[os.path.normpath(Path(listing).parent / page)] = plain
     app.add_js_file(None, body=f"const SUMMARIES = {json.dumps(said)};")
 
