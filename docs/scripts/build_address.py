@@ -63,7 +63,7 @@ PLACES = (
     ),
     Place(
         "docs/index.md",
-        "first choose [torch's CPU build](install.md).\n\n```sh\n",
+        "after choosing [torch's CPU build](install.md)):\n\n```sh\n",
         "git clone <address> && cd <name>\n",
     ),
     Place(
