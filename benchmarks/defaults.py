@@ -22,7 +22,7 @@ import torch
 from npa_envs.agents import load_policy
 from npa_envs.envs import particles_v0
 
-torch.set_num_threads(1)  # small worlds; a busy machine does not slow them down
+torch.set_num_threads(1)  # enough for small worlds
 ID, LEARNER, SEED, SECONDS = *sys.argv[1:3], int(sys.argv[3]), float(sys.argv[4])
 AGENTS = ID in particles_v0.SMALL
 METRIC = {"She": "distance", "Poi": "accuracy"}.get(ID[4:7], "loss")

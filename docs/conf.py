@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import io
+import json
 import os
 import re
 import sys
@@ -79,8 +80,8 @@ html_static_path = ["static/site.css"]
 html_css_files = ["site.css"]
 html_extra_path = ["static/index.html"]
 html_show_sphinx = False
-# Opened from a disk, a page cannot fetch others to quote them.
-html_show_search_summary = False
+html_favicon = "static/icon.svg"
+html_search_scorer = str(Path(__file__).parent / "static/search.js")
 if (address := repository_address()) is not None:
     html_baseurl = names_of(address)["site"]
     html_theme_options = {
@@ -113,6 +114,21 @@ def add_menus(_: Sphinx, name: str, source: list[str]) -> None:
             caption = f":caption: {heading}\n" if heading and name == root_doc else ""
             listed = "\n".join(names)
             source[0] += f"\n```{{toctree}}\n:hidden:\n{caption}\n{listed}\n```\n"
+
+
+SUMMARY = re.compile(r"^(?:- |\| )\[[^\]]+\]\(([\w./-]+)\.\w+\)(?:: | \| )?([^|\n]*)", re.MULTILINE)
+
+
+def add_summaries(app: Sphinx, name: str, *_: Any) -> None:
+    """Give the page of the search what the lists of pages say of each, in their order."""
+    if name != "search":
+        return
+    said = {}
+    for listing in LISTS[:2]:
+        for page, text in SUMMARY.findall((ROOT / f"{listing}.md").read_text(encoding="utf-8")):
+            plain = re.sub(r"[`]|\[([^\]]+)\]\([^)]+\)", r"\1", text).strip(" .")
+            said[os.path.normpath(Path(listing).parent / page)] = plain
+    app.add_js_file(None, body=f"const SUMMARIES = {json.dumps(said)};")
 
 
 SET_ASIDE: dict[str, list[str]] = {}
@@ -198,6 +214,7 @@ def setup(app: Sphinx) -> None:
     app.add_html_math_renderer("mathml", (write_formula, None), (write_formula, None))
     app.add_directive("command-help", CommandHelp)
     app.connect("source-read", add_menus)
+    app.connect("html-page-context", add_summaries)
     # Napoleon's own priority is 500.
     app.connect("autodoc-process-docstring", as_restructured_text, priority=100)
     app.connect("autodoc-process-docstring", put_back, priority=900)

@@ -68,7 +68,7 @@ def main():
     parser.add_argument("--steps", type=int, default=400)
     parser.add_argument("--film", type=Path, default=Path("boids.webp"), help="to write")
     given = parser.parse_args()
-    torch.set_num_threads(1)  # small worlds; a busy machine does not slow them down
+    torch.set_num_threads(1)  # enough for small worlds
     x, v = start(1000, torch.Generator().manual_seed(0))
     frames = [picture(x, v)]
     for k in range(given.steps):

@@ -25,7 +25,7 @@ given = parser.parse_args()
 
 NAME, LENGTH, CANDIDATES = "npa/Morphogenesis2DSmall-v0", 32, 32
 
-torch.set_num_threads(1)  # small worlds; a busy machine does not slow them down
+torch.set_num_threads(1)  # enough for small worlds
 envs = gym.make_vec(NAME, num_envs=CANDIDATES)
 test_envs = gym.make_vec(NAME, num_envs=32)
 test_envs.action_space.seed(0)

@@ -27,7 +27,7 @@ NAME, LENGTH, WORLDS, RATE = "npa/Morphogenesis2DSmall-v0", 32, 8, 4e-3
 # A step may change a state by as much as the rule says, and is not clipped.
 TASK = {"target": "heart", "state_scale": 1.0}
 
-torch.set_num_threads(1)  # small worlds; a busy machine does not slow them down
+torch.set_num_threads(1)  # enough for small worlds
 torch.manual_seed(0)
 envs = gym.make_vec(NAME, num_envs=WORLDS, **TASK).unwrapped
 test_envs = gym.make_vec(NAME, num_envs=32, **TASK)

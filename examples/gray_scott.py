@@ -91,7 +91,7 @@ def main():
     parser.add_argument("--particles", type=int, default=8192, help="more: a larger world")
     parser.add_argument("--film", type=Path, default=Path("gray_scott.webp"), help="to write")
     given = parser.parse_args()
-    torch.set_num_threads(1)  # small worlds; a busy machine does not slow them down
+    torch.set_num_threads(1)  # enough for small worlds
     x, s, eps = start(given.particles, torch.Generator().manual_seed(0))
     frames = [picture(x, s, eps)]
     for k in range(given.steps):

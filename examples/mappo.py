@@ -27,7 +27,7 @@ given = parser.parse_args()
 WORLDS, CYCLES, EPOCHS, PARTS, GAMMA, LAMBDA, CLIP, RATE = 8, 32, 4, 8, 0.9, 0.95, 0.2, 1e-3
 ROLLOUT = WORLDS * CYCLES  # steps of worlds in a round
 
-torch.set_num_threads(1)  # small worlds; a busy machine does not slow them down
+torch.set_num_threads(1)  # enough for small worlds
 torch.manual_seed(0)
 many = {"max_cycles": CYCLES, "world_count": WORLDS, "autoreset_mode": "disabled"}
 if given.env == "particles":  # the world of npa/MixingSmall-v0

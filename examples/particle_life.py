@@ -77,7 +77,7 @@ def main():
     parser.add_argument("--seed", type=int, default=0, help="of the table and the places")
     parser.add_argument("--film", type=Path, default=Path("particle_life.webp"), help="to write")
     given = parser.parse_args()
-    torch.set_num_threads(1)  # small worlds; a busy machine does not slow them down
+    torch.set_num_threads(1)  # enough for small worlds
     x, table = start(200, torch.Generator().manual_seed(given.seed))
     v, frames = torch.zeros_like(x), [picture(x)]
     for k in range(given.steps):

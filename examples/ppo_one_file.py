@@ -29,7 +29,7 @@ WORLDS, ROLLOUT, EPOCHS, MINIBATCH = 8, 128, 10, 64
 GAMMA, LAMBDA, CLIP, RATE = 0.9, 0.95, 0.2, 1e-3
 EVERY = 5  # rounds between evaluations
 
-torch.set_num_threads(1)  # small worlds; a busy machine does not slow them down
+torch.set_num_threads(1)  # enough for small worlds
 torch.manual_seed(0)
 envs = gym.make_vec(NAME, num_envs=WORLDS)
 test_envs = gym.make_vec(NAME, num_envs=16)

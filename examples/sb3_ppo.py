@@ -24,7 +24,7 @@ parser.add_argument("--curve", type=Path, default=Path("sb3_ppo.json"), help="to
 parser.add_argument("--policy", type=Path, help="to write: the policy, .safetensors")
 given = parser.parse_args()
 
-torch.set_num_threads(1)  # small worlds; a busy machine does not slow them down
+torch.set_num_threads(1)  # enough for small worlds
 name = given.env
 env = gym.make(name, render_mode="rgb_array")
 count = min(16, 2 + given.steps // 2000)  # held-out episodes

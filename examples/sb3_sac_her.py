@@ -24,7 +24,7 @@ parser.add_argument("--steps", type=int, default=15_000)
 parser.add_argument("--curve", type=Path, default=Path("sb3_sac_her.json"), help="to write")
 given = parser.parse_args()
 
-torch.set_num_threads(1)  # small worlds; a busy machine does not slow them down
+torch.set_num_threads(1)  # enough for small worlds
 name = "npa/Shepherd2DSmall-v0"
 env = gym.make(name, reward="sparse")
 count = min(32, 2 + given.steps // 500)  # held-out episodes

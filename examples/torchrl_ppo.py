@@ -26,7 +26,7 @@ parser.add_argument("--steps", type=int, default=15_360, help="of all worlds tog
 parser.add_argument("--curve", type=Path, default=Path("torchrl_ppo.json"), help="to write")
 given = parser.parse_args()
 
-torch.set_num_threads(1)  # small worlds; a busy machine does not slow them down
+torch.set_num_threads(1)  # enough for small worlds
 torch.manual_seed(0)
 name = "npa/Morphogenesis2D-v0"
 task = {

@@ -51,9 +51,20 @@ PLACES = (
     ),
     Place("README.md", "## Two commands\n\n```sh\n", "git clone <address> && cd <name>\n"),
     Place(
+        "README.md",
+        "## You want to watch and play\n\n```sh\n",
+        "git clone <address> && cd <name>  # if you have no clone yet\n",
+    ),
+    Place(
         "docs/index.md",
         "[All pages](pages.md)\n",
-        "\n**[Play in your browser](<site>gallery.html)**: all 2D rules, nothing to install.\n",
+        "\n**[Play in your browser](<site>gallery.html)**: all 2D rules, nothing to install. "
+        "[Source](<address>).\n",
+    ),
+    Place(
+        "docs/index.md",
+        "after choosing [torch's CPU build](install.md)):\n\n```sh\n",
+        "git clone <address> && cd <name>\n",
     ),
     Place(
         "docs/install.md",

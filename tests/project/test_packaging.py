@@ -156,7 +156,8 @@ def test_with_an_address_all_lines_lead_there(copy: Path) -> None:
         assert re.search("Made-Up/npa.envs-2|made-up.github.io", text), name
     assert f"({ADDRESS}/actions/workflows/ci.yml/badge.svg)]" in texts["README.md"]
     assert f"git clone {ADDRESS} && cd npa.envs-2\n" in texts["README.md"]
-    assert f"]({SITE}gallery.html)" in texts["docs/index.md"]
+    for part in (f"]({SITE}gallery.html)", f"[Source]({ADDRESS})", f"git clone {ADDRESS} && cd "):
+        assert part in texts["docs/index.md"]
     assert f'\nrepository-code: "{ADDRESS}"\n' in texts["CITATION.cff"]
     assert f"  url     = {{{ADDRESS}}},\n" in texts["docs/cite.md"]
     assert texts["CONTRIBUTING.md"].count("img.shields.io/github/stars/Made-Up/npa.envs-2)") == 2
