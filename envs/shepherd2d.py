@@ -81,10 +81,9 @@ class GoalBrushes(BrushSpaces):
         """Return observations, [..., O + 6], as a dictionary with both goals, [..., 3] each."""
         parts = torch.split(observation, [self._count, 3, 3], dim=-1)
         names = ("observation", "achieved_goal", "desired_goal")
-        return {
-            name: to_output(part.contiguous(), self._output)
-            for name, part in zip(names, parts, strict=True)
-        }
+        by_name = dict(zip(names, parts, strict=True))
+        # In the order of the space, which sorts its keys.
+        return {n: to_output(by_name[n].contiguous(), self._output) for n in self.observation_space}
 
 
 class ShepherdEpisode(NamedTuple):
