@@ -107,20 +107,19 @@ def load_policy(source: str, env: Any) -> Callable[[Any], Any]:
     worlds, task = unwrapped(env).worlds, unwrapped(env).task
     shipped, id = shipped_policies(), getattr(env.spec, "id", None)
     by_particle = task.controls not in ("brushes", "codes") and task.config.control != "central"
-    scripted = ["scripted"] * isinstance(task, GardenTask)
-    known = ["zero", "random", *scripted, *(["shipped"] * (id in shipped))]
+    special = {"scripted": isinstance(task, GardenTask), "shipped": id in shipped}
+    known = ["zero", "random", *(name for name, is_there in special.items() if is_there)]
     is_word = isinstance(source, str) and source == Path(source).stem and not Path(source).exists()
     rules = shipped_rules() | preset_rules() if by_particle else ()
     if is_word and source not in (*known, *rules):
-        is_lacking = source in ("scripted", "shipped")
-        hint = "take one that it has" if is_lacking else suggest(source, [*known, *rules])
+        hint = "take another" if source in special else suggest(source, [*known, *rules])
         raise NPAError(
             "source must be zero, random, scripted or shipped, of which the environment "
             f"{shown(id)} has {', '.join(known)}, or {'a rule' if by_particle else 'a file'}, got "
             f"{shown(source)}: {hint}"
         )
     if source == "shipped":
-        source = str(shipped[id])
+        source = str(shipped[str(id)])
     if by_particle:
         if source in ("zero", "random"):
             return (ZeroPolicy if source == "zero" else RandomPolicy)(env)

@@ -153,9 +153,8 @@ class MultiSpeciesVectorEnv(AgentsEnv):
         live = self._columns(self.worlds.live)
         species = self.worlds.agent_species.tolist()
         return {
-            agent: {"species": species[k], "live": live[agent]}
-            | dict(zip(numbers, rows[k], strict=True))
-            for k, agent in enumerate(self.possible_agents)
+            agent: {"species": own, "live": live[agent]} | dict(zip(numbers, row, strict=True))
+            for agent, own, row in zip(self.possible_agents, species, rows, strict=False)
         }
 
     def _step_infos(

@@ -48,7 +48,7 @@ def test_a_policy_that_does_not_exist_or_fit_is_refused():
     for name, id, message in [
         ("shipped", "npa/Shapeshifter2D-v0", "has zero, random, or a file, got 'shipped'"),
         ("scripted", "npa/Morphogenesis2DSmall-v0", "has zero, random, or a rule, got 'scripted'"),
-        ("shiped", GARDENER, "has zero, random, scripted, shipped, .* did you mean 'shipped'"),
+        ("scriptd", GARDENER, "has zero, random, scripted, shipped, .* did you mean 'scripted'"),
         ("hart", "npa/Morphogenesis2DSmall-v0", "did you mean 'heart'"),
     ]:
         with pytest.raises(NPAError, match=message):
