@@ -305,8 +305,8 @@ class WorldVecEnv(_EpisodeRows):
             raise NPAError(f"env must be a vector environment, got {env}: {MAKE_VECTOR}")
         if hasattr(env, "possible_agents"):
             raise NPAError(
-                f"env must have one agent, got {type(env).__name__} with {env.possible_agents}: let "
-                "one learn in gym.make_vec('npa/Gardener2D-v0'), or step both by hand"
+                f"env must have one agent, got {type(env).__name__} with {env.possible_agents}: "
+                "let one learn in gym.make_vec('npa/Gardener2D-v0'), or step both by hand"
             )
         ours = isinstance(env.unwrapped, NPAVectorEnv)
         made = "" if ours else "vectorization_mode='vector_entry_point', "
