@@ -17,9 +17,17 @@ from torch import Tensor, nn
 from npa_envs.agents.garden_policies import ScriptedGardener, ScriptedShepherd
 from npa_envs.agents.policies import RandomPolicy, RulePolicy, ZeroPolicy, unwrapped
 from npa_envs.atomic_files import checked_path
+from npa_envs.envs.garden.base import GardenTask
 from npa_envs.envs.shepherd2d import ShepherdTask
 from npa_envs.errors import NPAError, shown, suggest
-from npa_envs.rule.files import check_checksum, load_rule, read_tensors, write_tensors
+from npa_envs.rule.files import (
+    check_checksum,
+    load_rule,
+    preset_rules,
+    read_tensors,
+    shipped_rules,
+    write_tensors,
+)
 
 FORMAT_NAME = "npa-envs policy"
 
@@ -97,12 +105,22 @@ def load_policy(source: str, env: Any) -> Callable[[Any], Any]:
         NPAError: There is no such policy, its file is damaged, or it does not fit `env`.
     """
     worlds, task = unwrapped(env).worlds, unwrapped(env).task
+    shipped, id = shipped_policies(), getattr(env.spec, "id", None)
+    by_particle = task.controls not in ("brushes", "codes") and task.config.control != "central"
+    special = {"scripted": isinstance(task, GardenTask), "shipped": id in shipped}
+    known = ["zero", "random", *(name for name, is_there in special.items() if is_there)]
+    is_word = isinstance(source, str) and source == Path(source).stem and not Path(source).exists()
+    rules = shipped_rules() | preset_rules() if by_particle else ()
+    if is_word and source not in (*known, *rules):
+        hint = "take another" if source in special else suggest(source, [*known, *rules])
+        raise NPAError(
+            "source must be zero, random, scripted or shipped, of which the environment "
+            f"{shown(id)} has {', '.join(known)}, or {'a rule' if by_particle else 'a file'}, got "
+            f"{shown(source)}: {hint}"
+        )
     if source == "shipped":
-        shipped, id = shipped_policies(), getattr(env.spec, "id", None)
-        if id not in shipped:
-            raise NPAError(f"no policy is shipped for {shown(id)}: {suggest(id, shipped)}")
-        source = str(shipped[id])
-    if task.controls not in ("brushes", "codes") and task.config.control != "central":
+        source = str(shipped[str(id)])
+    if by_particle:
         if source in ("zero", "random"):
             return (ZeroPolicy if source == "zero" else RandomPolicy)(env)
         return RulePolicy(load_rule(source, device=worlds.device).float(), env)

@@ -165,18 +165,23 @@ class GardenersVectorEnv(NPAVectorEnv):
     """B worlds of `GardenersEnv`, stepped together, by an `NPAVectorEnv` with two agents.
 
     World k, reset with `seed`, is that with `seed + k` by itself. Each agent has observations
-    [B, O], actions [B, J W], rewards and flags [B], and the infos of `npa/Gardener2D-v0`.
+    [B, O], actions [B, J W], rewards and flags [B], and the infos of `npa/Gardener2D-v0`. Its other
+    attributes are those of `MultiSpeciesVectorEnv`.
     """
 
     task_type = _SharedTask
-    possible_agents = AGENTS
 
     def __init__(self, max_cycles: int = 32, *, world_count: int = 1, **config: Any) -> None:
         count = checked_count("world_count", world_count)
         steps = {"episode_steps": checked_count("max_cycles", max_cycles)}
         super().__init__(count, max_episode_steps=max_cycles, **(CALM | config | steps))
+        self.agents = self.possible_agents = list(AGENTS)
+        self.world_count, self.max_cycles = count, steps["episode_steps"]
         self.single_observation_spaces = dict.fromkeys(AGENTS, self.single_observation_space)
         self.single_action_spaces = dict.fromkeys(AGENTS, self.single_action_space)
+        self.observation_spaces = dict.fromkeys(AGENTS, self.observation_space)
+        self.action_spaces = dict.fromkeys(AGENTS, self.action_space)
+        self.single_state_space = state_space(self.worlds.physics, self.worlds.x.shape[1])
 
     def reset(self, **options: Any) -> tuple[Any, dict[str, Any]]:
         """Start episodes as `NPAVectorEnv.reset` does; return both agents' observations, infos."""

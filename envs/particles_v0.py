@@ -49,8 +49,9 @@ class ParticlesEnv(CrowdEnv):
     | `"symbiosis"` | `npa/SymbiosisParticles-v0` |
 
     `npa/SegregationParticlesSmall-v0` and so on have the settings of `npa/SegregationSmall-v0`. A
-    policy that all particles share learns there by the defaults of PPO. The ids are for
-    `pettingzoo.make`, of PettingZoo 1.27 or newer, once `npa_envs.envs.particles_v0` is imported.
+    policy that all particles share learns there by the defaults of PPO. All functions take the ids,
+    and so does `pettingzoo.make`, of PettingZoo 1.27 or newer, once `npa_envs.envs.particles_v0` is
+    imported.
 
     ## Observation space
 
@@ -144,7 +145,8 @@ def batched(
 
 def _settings(task: str, species_count: int | None, config: dict[str, Any]) -> dict[str, Any]:
     """Return keywords as `multispecies_v0.settings`, with few particles."""
-    keywords = settings(task, species_count, config)
+    of_species = (ENVIRONMENTS | SMALL).get(task, task) if isinstance(task, str) else task
+    keywords = settings(of_species, species_count, config)
     if not as_python(keywords.get("particle_counts")):
         keywords.setdefault("particle_count", PARTICLE_COUNT)
     fields = {name: value for name, value in keywords.items() if name != "task"}

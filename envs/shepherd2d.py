@@ -79,12 +79,10 @@ class GoalBrushes(BrushSpaces):
 
     def observation_output(self, observation: Tensor) -> Any:
         """Return observations, [..., O + 6], as a dictionary with both goals, [..., 3] each."""
-        parts = torch.split(observation, [self._count, 3, 3], dim=-1)
-        names = ("observation", "achieved_goal", "desired_goal")
-        return {
-            name: to_output(part.contiguous(), self._output)
-            for name, part in zip(names, parts, strict=True)
-        }
+        observed, achieved, desired = torch.split(observation, [self._count, 3, 3], dim=-1)
+        # In the order of the space, which sorts its keys.
+        parts = {"achieved_goal": achieved, "desired_goal": desired, "observation": observed}
+        return {name: to_output(part.contiguous(), self._output) for name, part in parts.items()}
 
 
 class ShepherdEpisode(NamedTuple):

@@ -76,6 +76,9 @@ class TextureEnv(NPAEnv):
 
     A particle's own loss is what its part of the picture adds to the texture loss, to first order.
 
+    On a CPU four fifths of a step's time go into the loss, which sorts projections of all patches,
+    world by world, so batches gain little. With `resolution=32` it takes a quarter.
+
     ## Starting state
 
     Particles are uniform in the box, all states are zero.

@@ -10,12 +10,16 @@ from pathlib import Path
 
 import gymnasium as gym
 import torch
-from tensordict.nn import AddStateIndependentNormalScale, TensorDictModule
 from torch.distributions import Independent, Normal
-from torchrl.collectors import Collector
-from torchrl.modules import MLP, ProbabilisticActor, ValueOperator
-from torchrl.objectives import ClipPPOLoss
-from torchrl.objectives.value import GAE
+
+try:
+    from tensordict.nn import AddStateIndependentNormalScale, TensorDictModule
+    from torchrl.collectors import Collector
+    from torchrl.modules import MLP, ProbabilisticActor, ValueOperator
+    from torchrl.objectives import ClipPPOLoss
+    from torchrl.objectives.value import GAE
+except ImportError as error:
+    raise SystemExit(f"{error}: pip install 'npa-envs[torchrl]'") from error
 
 import npa_envs  # noqa: F401 (registers the ids)
 from npa_envs.agents import RandomPolicy, ZeroPolicy, evaluate_policy

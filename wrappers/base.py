@@ -91,10 +91,10 @@ RESTARTS = {
 """What environments of each autoreset mode do."""
 
 
-def check_autoreset(mode: AutoresetMode, name: str) -> None:
-    """Check that an environment's autoreset mode is the one called `name`."""
+def check_autoreset(mode: AutoresetMode, name: str, made: str = "") -> None:
+    """Check that an environment's autoreset mode is the one called `name`; errors advise `made`."""
     if mode is not AUTORESET_MODES[name]:
-        hint = f"make it with autoreset_mode={shown(name)}"
+        hint = f"make it with {made}autoreset_mode={shown(name)}"
         raise NPAError(f"env must {RESTARTS[name]}, got {mode}: {hint}")
 
 

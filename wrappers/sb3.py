@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from abc import abstractmethod
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any, NoReturn
@@ -13,6 +14,7 @@ from gymnasium.vector import VectorWrapper
 from numpy.typing import NDArray
 from torch import Tensor
 
+from npa_envs.envs.core.vector import NPAVectorEnv
 from npa_envs.envs.multi.vector import MultiSpeciesVectorEnv
 from npa_envs.errors import NPAError, check_known, importing, shown
 from npa_envs.wrappers.base import (
@@ -301,7 +303,14 @@ class WorldVecEnv(_EpisodeRows):
     def __init__(self, env: Any) -> None:
         if not hasattr(env, "single_action_space"):
             raise NPAError(f"env must be a vector environment, got {env}: {MAKE_VECTOR}")
-        check_autoreset(autoreset_mode(env), "same-step")
+        if hasattr(env, "possible_agents"):
+            raise NPAError(
+                f"env must have one agent, got {type(env).__name__} with {env.possible_agents}: "
+                "let one learn in gym.make_vec('npa/Gardener2D-v0'), or step both by hand"
+            )
+        ours = isinstance(env.unwrapped, NPAVectorEnv)
+        made = "" if ours else "vectorization_mode='vector_entry_point', "
+        check_autoreset(autoreset_mode(env), "same-step", made)
         super().__init__(
             env, env.num_envs, 1, env.single_observation_space, env.single_action_space
         )
@@ -355,8 +364,9 @@ class SpeciesVecEnv(RowVecEnv):
     their actions are ignored. When the world ends they are done again.
 
     Args:
-        env: From `multispecies_v0.batched`, with same-step autoreset.
-        others: Policies of the species that are not rows, by name.
+        env: From `multispecies_v0.batched`, or from `particles_v0.batched`, whose rows get their
+            own rewards and end by themselves; with same-step autoreset.
+        others: Policies of the species, or particles, that are not rows, by name.
     """
 
     def __init__(
@@ -382,15 +392,20 @@ class SpeciesVecEnv(RowVecEnv):
         if not self.rows_of:
             raise NPAError("others must not name all species: at least one has to be rows")
         spaces = env.single_observation_spaces
-        self._counts = np.array([spaces[name].shape[0] for name in self.rows_of])
-        observed = row_space(spaces[self.rows_of[0]])
+        shapes = [spaces[name].shape for name in self.rows_of]
+        self._counts = np.array([math.prod(shape[:-1]) for shape in shapes])
+        self._of_particles = len(shapes[0]) == 1
+        one_row = (lambda space: space) if self._of_particles else row_space
+        observed = one_row(spaces[self.rows_of[0]])
         self._tags = None
         if not self.others:
-            tags = np.eye(len(self._counts), dtype=np.float32).repeat(self._counts, axis=0)
+            species = env.worlds.agent_species[: len(self.rows_of)]
+            self._tag_of = np.eye(species.max() + 1, dtype=np.float32)[species]
+            tags = self._tag_of.repeat(self._counts, axis=0)
             self._tags = torch.from_numpy(tags).to(env.worlds.device)
-            tag = np.ones(len(self._counts), np.float32)
+            tag = np.ones(tags.shape[1], np.float32)
             observed = Box(np.append(observed.low, 0.0 * tag), np.append(observed.high, tag))
-        acted = row_space(env.single_action_spaces[self.rows_of[0]])
+        acted = one_row(env.single_action_spaces[self.rows_of[0]])
         super().__init__(env, env.world_count, int(self._counts.sum()), observed, acted)
 
     def step_wait(self) -> RowSteps:
@@ -401,6 +416,8 @@ class SpeciesVecEnv(RowVecEnv):
         if self._observations is None:
             raise NPAError("step needs worlds: call reset first")
         row_actions = np.split(self.taken_actions(), np.cumsum(self._counts)[:-1], axis=1)
+        if self._of_particles:
+            row_actions = [rows[:, 0] for rows in row_actions]
         actions: dict[str, Any] = dict(zip(self.rows_of, row_actions, strict=True))
         for name, policy in self.others.items():
             actions[name] = policy(self._observations[name])
@@ -436,18 +453,19 @@ class SpeciesVecEnv(RowVecEnv):
 
         Args:
             model: The model.
-            species: Name of the species, one of `rows_of`.
+            species: Name of the species, or particle, one of `rows_of`.
             deterministic: Whether it acts by its mean instead of a random action.
         """
         check_known("species must be one whose particles are rows, got", species, self.rows_of)
         tag = None
         if self._tags is not None:
-            tag = np.eye(len(self.rows_of), dtype=np.float32)[self.rows_of.index(species)]
+            tag = self._tag_of[self.rows_of.index(species)]
         return RowPolicy(model, deterministic=deterministic, tag=tag)
 
     def _rows(self, by_species: Mapping[str, Any]) -> Tensor:
         """Return the rows' observations [B, R, P]; tags are appended if all species are rows."""
-        rows = torch.cat([as_tensor(by_species[name]) for name in self.rows_of], dim=1)
+        parts = [as_tensor(by_species[name]) for name in self.rows_of]
+        rows = torch.stack(parts, dim=1) if self._of_particles else torch.cat(parts, dim=1)
         if self._tags is None:
             return rows
         return torch.cat((rows, self._tags.to(rows.device).expand(len(rows), -1, -1)), dim=2)

@@ -40,6 +40,7 @@ from npa_envs.envs.core.vector import NPAVectorEnv
 from npa_envs.envs.garden.base import GardenEnv
 from npa_envs.envs.trained_rules import RuleDrivenWorlds
 from npa_envs.registration import (
+    ALL,
     CENTRAL,
     CODED,
     ENVIRONMENTS,
@@ -235,6 +236,7 @@ def page(registration: Registration) -> str:
             ("Particles N, channels C", f"{count}, {config.state_dim}"),
             *((heading, f"`{space}`") for heading, space in spaces.items()),
             ("Steps of an episode", str(registration.max_episode_steps)),
+            *learned_by(registration),
             ("Classes", f"`{registration.entry_point}`, `{registration.vector_entry_point}`"),
         ],
     )
@@ -242,6 +244,29 @@ def page(registration: Registration) -> str:
     example = EXAMPLE.format(id=registration.id)
     body = [f"## {heading}\n\n{content}" for heading, content in text.items()]
     return "\n\n".join((species_pages.MADE, *opening, example, *body)) + "\n"
+
+
+def learned_by(registration: Registration) -> list[tuple[str, str]]:
+    """Return the row of an environment's first table that says how learners take it, or none."""
+    task = environment_class(registration).task_type
+    if task.worlds_type is RuleDrivenWorlds:
+        return []
+    if "control" in task.config_type.fixed:
+        return [("Learned by", "`ParticleVecEnv`")]
+    central = (f", `{row.id}`" for row in CENTRAL if row.name == registration.name)
+    taken = '`ParticleVecEnv`; without it: `control="central"`'
+    return [("Learned by", taken + "".join(central))]
+
+
+def size_table() -> str:
+    """Return all ids with their sizes as a table, Markdown."""
+    rows = []
+    for row in sorted(ALL, key=lambda one: (one.module, len(one.id))):
+        env = environment_class(row)(**row.keywords)
+        shape = str(list(env.action_space.shape or ())).replace(", ", "×")
+        sizes = str(env.config.particle_count), str(row.max_episode_steps), shape
+        rows.append((f"`{row.id}`", *sizes))
+    return table(("Id", "Particles", "Steps", "Action"), rows)
 
 
 def picture(registration: Registration) -> str:
@@ -266,7 +291,8 @@ def index() -> str:
     )
     rows += [gardeners_page.index_row(), *species_pages.index_rows()]
     listing = table(("Environment", "Task"), rows)
-    return "\n\n".join((species_pages.MADE, "# Environments", opening, listing)) + "\n"
+    parts = (species_pages.MADE, "# Environments", opening, listing, size_table())
+    return "\n\n".join(parts) + "\n"
 
 
 def pages() -> dict[str, str]:

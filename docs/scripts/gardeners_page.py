@@ -53,7 +53,7 @@ def page() -> str:
             ("Observation space", f"`{env.observation_space(first)}`"),
             ("Action space", f"`{env.action_space(first)}`"),
             ("Steps of an episode", str(env.max_cycles)),
-            ("Functions", "`parallel_env`, `env`, `raw_env`"),
+            ("Functions", "`parallel_env`, `env`, `raw_env`, `batched`"),
         ],
     )
     made = NOTE.format(script="build_environment_pages.py", source="docstrings")

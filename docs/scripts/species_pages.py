@@ -106,6 +106,7 @@ def page(name: str) -> str:
         text["Arguments"] += "\n\n" + argument_tables()
     env = module.parallel_env()
     agent = env.possible_agents[0]
+    short = module.__name__.rpartition(".")[2]
     facts = table(
         ("", "By default"),
         [
@@ -114,10 +115,10 @@ def page(name: str) -> str:
             ("Action space", f"`{env.action_space(agent)}`"),
             ("State space", f"float32, shape {env.state_space.shape}"),
             ("Steps of an episode", str(env.max_cycles)),
-            ("Functions", "`parallel_env`, `env`, `raw_env`"),
+            ("Functions", "`parallel_env`, `env`, `raw_env`, `batched`"),
+            ("Learned by", f"`SpeciesVecEnv({short}.batched(...))`"),
         ],
     )
-    short = module.__name__.rpartition(".")[2]
     example = EXAMPLE.format(module=short) + (RULES if name == "MultiSpecies" else "")
     film = FILM.name
     picture = film_and_strip(CAPTION, film, IMAGE.name)

@@ -309,8 +309,9 @@ class EnvConfig(WorldConfig):
     action, so learners can mask their likelihoods."""
 
     episode_steps: int | None = None
-    """Steps after which the environment itself truncates an episode; None: never. Needed where
-    reward is "sparse", except by `make_vec`, which has `max_episode_steps`."""
+    """Steps after which the environment itself truncates an episode; None: never. The limit of the
+    id stays: the first to be reached ends the episode. Needed where reward is "sparse", except by
+    `make_vec`, which has `max_episode_steps`."""
 
     control: Control = "particles"
     """Who acts: "particles", by a row each; or "central", one controller of few numbers, see the

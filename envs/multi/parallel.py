@@ -43,6 +43,10 @@ class KnownAgents(pettingzoo.ParallelEnv):  # type: ignore[misc]
         """Return the space of an agent's actions, the same object each time."""
         return self.action_spaces[self._known(agent)]
 
+    def __repr__(self) -> str:
+        count, name = len(self.possible_agents), self.metadata["name"]
+        return f"<{type(self).__name__} {name}: {count} agents, max_cycles={self.max_cycles}>"
+
     def _known(self, agent: str) -> str:
         if agent not in self.observation_spaces:
             hint = suggest(agent, self.possible_agents[:8])

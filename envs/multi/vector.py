@@ -151,9 +151,10 @@ class MultiSpeciesVectorEnv(AgentsEnv):
         all_numbers = torch.stack(list(numbers.values())).float()
         rows = self._out(torch.where(mask, all_numbers, 0.0).movedim(2, 0).contiguous())
         live = self._columns(self.worlds.live)
+        species = self.worlds.agent_species.tolist()
         return {
-            agent: {"species": k, "live": live[agent]} | dict(zip(numbers, rows[k], strict=True))
-            for k, agent in enumerate(self.possible_agents)
+            agent: {"species": own, "live": live[agent]} | dict(zip(numbers, row, strict=True))
+            for agent, own, row in zip(self.possible_agents, species, rows, strict=False)
         }
 
     def _step_infos(

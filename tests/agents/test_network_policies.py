@@ -46,8 +46,14 @@ def test_a_saved_policy_is_loaded_bit_for_bit_and_damage_is_found(tmp_path):
 
 
 def test_a_policy_that_does_not_exist_or_fit_is_refused():
-    with pytest.raises(NPAError, match="no policy is shipped for 'npa/Shapeshifter2D-v0'"):
-        load_policy("shipped", gymnasium.make("npa/Shapeshifter2D-v0"))
+    for name, id, message in [
+        ("shipped", "npa/Shapeshifter2D-v0", "has zero, random, or a file, got 'shipped'"),
+        ("scripted", "npa/Morphogenesis2DSmall-v0", "has zero, random, or a rule, got 'scripted'"),
+        ("scriptd", GARDENER, "has zero, random, scripted, shipped, .* did you mean 'scripted'"),
+        ("hart", "npa/Morphogenesis2DSmall-v0", "did you mean 'heart'"),
+    ]:
+        with pytest.raises(NPAError, match=message):
+            load_policy(name, gymnasium.make(id))
     with pytest.raises(NPAError, match="the policy must fit the environment"):
         load_policy("shipped", gymnasium.make(GARDENER, place_count=3))
 

@@ -251,6 +251,7 @@ COSINE, SINE = np.cos(0.5), np.sin(0.5)
 def test_a_shepherd_sees_what_became_of_a_creature_that_stays_whole(aim, matrix, shift, difference):
     env = make(SHEPHERD, aim=aim, target="gecko", resolution=32, particle_count=256, eps=0.1)
     seen, _ = env.reset(seed=0)
+    assert list(seen) == list(env.observation_space)
     assert abs(seen["achieved_goal"][2]) < 1e-3
     assert env.unwrapped.compute_reward(seen["achieved_goal"], seen["desired_goal"], {}) < 0
     x, s = env.unwrapped.particles()

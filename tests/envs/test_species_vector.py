@@ -167,6 +167,41 @@ def test_worlds_of_particles_or_gardeners_equal_single_ones(module, keywords):
     assert (early > 0) == ("position_limit" in keywords)
 
 
+@pytest.mark.parametrize(
+    ("module", "keywords"),
+    [
+        (multispecies_v0, {"task": "npa/SegregationSmall-v0", "max_cycles": 3}),
+        (particles_v0, {"task": "npa/SegregationParticlesSmall-v0", "max_cycles": 3}),
+        (gardeners_v0, GARDEN),
+    ],
+)
+def test_batches_of_all_kinds_of_agents_have_the_same_attributes(module, keywords):
+    envs = module.batched(world_count=2, **keywords)
+    assert (envs.world_count, envs.max_cycles) == (2, 3)
+    observations, _ = envs.reset(seed=0)
+    for _ in range(4):
+        for agent, seen in observations.items():
+            assert envs.observation_spaces[agent].contains(seen)
+            assert envs.single_observation_spaces[agent].contains(seen[1])
+        assert envs.single_state_space.contains(envs.state()[0])
+        actions = {agent: envs.action_spaces[agent].sample() for agent in envs.agents}
+        observations, *_ = envs.step(actions)
+
+
+def test_ids_of_particles_are_the_worlds_of_the_ids_of_species():
+    tasks = ("npa/InvasionParticlesSmall-v0", "npa/InvasionSmall-v0")
+    env, same = (particles_v0.parallel_env(task, max_cycles=2) for task in tasks)
+    assert repr(env) == "<ParticlesEnv npa_particles_v0: 64 agents, max_cycles=2>"
+    env.reset(seed=3)
+    same.reset(seed=3)
+    assert np.array_equal(env.state(), same.state())
+    envs = particles_v0.batched("npa/SegregationParticles-v0")
+    _, infos = envs.reset(seed=0)
+    assert [infos[agent]["species"] for agent in envs.agents] == [0] * 32 + [1] * 32
+    refused("task must be a known word", particles_v0.batched, "npa/SegregationParticles-v1")
+    refused("task must be a known word", particles_v0.batched, ["npa/SegregationParticles-v0"])
+
+
 def test_gardeners_together_need_both_actions():
     envs = gardeners_v0.batched(world_count=2, **GARDEN)
     envs.reset(seed=0)

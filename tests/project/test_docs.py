@@ -288,6 +288,11 @@ PROGRAMS = {
         slice(2, None),
         "stable_baselines3",
     ),
+    "training": Program(
+        ("model.num_timesteps == 2048", "model.action_space.shape == (32,)"),
+        (("37_000", "8"),),
+        library="stable_baselines3",
+    ),
     "textures": Program(("printed.count('tensor([') == 2",)),
     "point_classification": Program(
         ("'AccuracyRow(step=8' in printed", "points.shape == (1, 128, 2)")

@@ -14,6 +14,7 @@ from npa_envs.tasks.losses.texture import (
     WEIGHTS_FILE,
     LossOptions,
     VGGTransport,
+    in_order,
     load_vgg_weights,
     make_texture_loss,
     moment_distance,
@@ -237,6 +238,20 @@ def test_nothing_is_read_across_the_edges_of_a_target_that_does_not_tile():
     every = rolled_patches(image.numpy(), 5) @ loss.bases[0].numpy()
     inside = every.reshape(16, 16, -1)[2:-2, 2:-2].reshape(144, -1)
     np.testing.assert_allclose(actual[0].numpy(), inside, rtol=0.0, atol=1e-14)
+
+
+def test_values_without_a_gradient_are_in_the_order_that_torch_gives_them():
+    generator = torch.Generator().manual_seed(0)
+    for count in (1, 2, 31, 1024, 4095):
+        values = torch.randn(count, 3, generator=generator).T
+        values[1] = (2.0 * values[1]).round()
+        values[2, : count // 2] = torch.nan
+        before = values.clone()
+        found, expected = in_order(values), before.clone().requires_grad_().sort().values
+        same = {"rtol": 0.0, "atol": 0.0, "equal_nan": True}
+        torch.testing.assert_close(found, expected.detach(), **same)
+        # The argument is not changed.
+        torch.testing.assert_close(values, before, **same)
 
 
 def test_quantiles_resolve_a_distribution_as_finely_as_asked_for():

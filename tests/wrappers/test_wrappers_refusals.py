@@ -13,7 +13,7 @@ from support.wrapped_envs import ACTIONS, batched, single
 
 import npa_envs
 from npa_envs.cli import main
-from npa_envs.envs import multispecies_v0
+from npa_envs.envs import gardeners_v0, multispecies_v0
 from npa_envs.tasks.damage import DamageEvent, parse_damage
 from npa_envs.wrappers import (
     DamageEvents,
@@ -118,6 +118,14 @@ SB3_REFUSALS = [
     (lambda w: w.SpeciesVecEnv(species(**DISABLED)), SAME_STEP),
     (lambda w: w.ParticleVecEnv(single()), "vector_entry_point"),
     (lambda w: w.WorldVecEnv(single()), "env must be a vector environment"),
+    (
+        lambda w: w.WorldVecEnv(gym.make_vec("npa/Gardener2DSmall-v0", 2, "sync")),
+        f"vectorization_mode='vector_entry_point', {SAME_STEP}",
+    ),
+    (
+        lambda w: w.WorldVecEnv(gardeners_v0.batched(particle_count=64, grow_steps=1, seed_pool=1)),
+        r"one agent, got GardenersVectorEnv with \['keeper_0', 'raider_0'\]",
+    ),
     (
         lambda w: started(w.WorldVecEnv, batched(2)).step(np.zeros((2, 63, ACTIONS), np.float32)),
         r"got \(2, 63, 18\)",

@@ -250,6 +250,38 @@ def test_rows_are_the_particles_of_species_and_others_act_by_policies(names, out
             assert np.array_equal(infos[15]["terminal_observation"][:66], final[1, 4])
 
 
+def test_rows_of_particles_that_are_agents_have_their_own_rewards_and_end_by_themselves():
+    fields = {"task": "npa/SegregationParticlesSmall-v0", "position_limit": 0.3, "max_cycles": 6}
+    rows, envs = (particles_v0.batched(world_count=2, **fields) for _ in range(2))
+    rows = SpeciesVecEnv(rows)
+    rows.seed(3)
+    seen, (observations, infos) = rows.reset(), envs.reset(seed=3)
+    tags = np.eye(2, dtype="f4")[[0] * 32 + [1] * 32]
+    generator, early = np.random.default_rng(0), 0
+    for step in range(1, 13):
+        for k in range(2):
+            whole = np.stack([observations[agent][k] for agent in envs.agents])
+            live = np.array([[infos[agent]["live"][k]] for agent in envs.agents])
+            shown = np.where(live, np.hstack((whole, tags)), 0.0)
+            assert np.array_equal(seen.reshape(2, 64, -1)[k], shown)
+        actions = generator.uniform(-1, 1, (128, 6)).astype("f4")
+        seen, paid, done, _ = rows.step(actions)
+        by_agent = dict(zip(envs.agents, actions.reshape(2, 64, 6).swapaxes(0, 1), strict=True))
+        observations, rewards, ended, _, infos = envs.step(by_agent)
+        assert np.array_equal(paid.reshape(2, 64).T, np.stack(list(rewards.values())))
+        ends = np.stack(list(ended.values())).T.reshape(-1)
+        early += ends.sum()
+        assert np.array_equal(done, ends | (step % 6 == 0))
+    assert 0 < early < 256
+    model = sb3.PPO("MlpPolicy", rows, n_steps=4, batch_size=64, n_epochs=1, device="cpu")
+    model.learn(4 * 128)
+    action = rows.policy(model, "particle_40", deterministic=True)(observations["particle_40"])
+    expected = model.predict(
+        np.hstack((observations["particle_40"], tags[[40, 40]])), None, None, True
+    )
+    assert np.array_equal(action, expected[0])
+
+
 def test_supersuit_trains_on_particles():
     supersuit = pytest.importorskip("supersuit")
     env = particles_v0.parallel_env(**small("mixing", particle_count=16, state_dim=4))
