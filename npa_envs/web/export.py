@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import base64
+import contextlib
 import hashlib
 import html
 import io
 import json
 import re
 from collections.abc import Iterable, Mapping, Sequence
+from importlib.metadata import PackageNotFoundError, metadata
 from pathlib import Path
 from typing import Any, cast
 from urllib.parse import quote
@@ -260,6 +262,7 @@ def page_text(
             f'<meta http-equiv="Content-Security-Policy" content="{policy}">',
         ),
         ("<title>npa-envs</title>", f"<title>{html.escape(title)}</title>"),
+        ('<p id="note" role="status"></p>', f'<p id="note" role="status"></p>\n{_about()}'),
         ('<link rel="stylesheet" href="page.css">', f"<style>{style}</style>"),
         (
             '<script type="module" src="server_connection.js"></script>',
@@ -273,6 +276,25 @@ def page_text(
             raise ValueError(f"index.html must hold {before!r} once, found {page.count(before)}")
         page = page.replace(before, after)
     return page
+
+
+def _about() -> str:
+    """Return what the page is and where it comes from, with the repository if that is known."""
+    links = [("https://arxiv.org/abs/2601.16096", "Neural Particle Automata, arXiv 2601.16096")]
+    with contextlib.suppress(PackageNotFoundError):  # The package is on the path, not installed.
+        urls = metadata("npa-envs").get_all("Project-URL") or []
+        found = dict(line.split(", ", 1) for line in urls)
+        links += [(found["Repository"], "npa-envs")] if "Repository" in found else []
+    anchors = " · ".join(
+        f'<a href="{html.escape(address)}" target="_blank" rel="noopener">{text}</a>'
+        for address, text in links
+    )
+    return f"""<details id="about">
+<summary aria-label="What is this?" title="What is this?">?</summary>
+<p>Every particle runs the same small neural network and perceives only its neighbours.
+Wipe a part and watch.</p>
+<p>{anchors}</p>
+</details>"""
 
 
 def _gallery(title: str, previews: Mapping[str, str]) -> str:

@@ -94,7 +94,8 @@ class TrainingEvent(TypedDict, total=False):
     iteration: int
     total: int  # Iterations of the whole run.
     seconds: float  # Time of the training so far [s].
-    seconds_left: float  # Estimated [s].
+    expected: float | None  # Estimate of the whole run on an idle CPU [s]; None: on CUDA.
+    seconds_left: float  # As measured so far [s].
     loss: float  # Training loss.
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import os
 import secrets
 import shutil
@@ -156,11 +157,14 @@ class Training:
         task = "morphogenesis2d" if flat else "morphogenesis3d"
         target = folder / PICTURE if flat else stored
         text = stored.read_text("utf-8") if stored.name == EMOJI else target
+        entry = task_entry(task)
         cuda = self._device != "cpu"
-        best = cuda and "best" in task_entry(task).presets
+        best = cuda and "best" in entry.presets
         preset = self._preset or ("best" if best else "fast")
         found = {"picture": PICTURE} if flat else {}
-        self._set(state="starting", note=note, preset=preset, **found)
+        config = dataclasses.replace(entry.presets[preset], device=self._device)
+        expected = entry.expected_seconds(config)
+        self._set(state="starting", note=note, preset=preset, expected=expected, **found)
         self._call(
             [
                 "npa_envs", "train", task, f"--target={text}", f"--out={folder}",

@@ -20,7 +20,7 @@ from npa_envs.rule.files import load_rule, save_rule
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.damage import DAMAGE_SIZES
 from npa_envs.tasks.point_classification import class_colours
-from npa_envs.web import messages
+from npa_envs.web import export, messages
 from npa_envs.web.export import check_browser_rule, export_web, joined_modules, page_rule, page_text
 from npa_envs.web.live_world import ColouredWorld, Colouring
 from npa_envs.web.rule_world import RuleWorld
@@ -367,8 +367,8 @@ def test_a_page_is_one_small_file_that_asks_for_nothing(tmp_path):
     text = page.read_text(encoding="utf-8")
     assert len(text) < 300_000
     assert "default-src 'none'" in text
-    # What a page could load: no element of it names anything but data.
-    loads = re.findall(r"""<[^<>]*\b(?:src|href|action)\s*=\s*["']?([^"'\s>]+)""", text)
+    # What a page could load: no element but links names anything but data.
+    loads = re.findall(r"""<(?!a )[^<>]*\b(?:src|href|action)\s*=\s*["']?([^"'\s>]+)""", text)
     assert [address for address in loads if not address.startswith(("data:", "#"))] == []
     assert not re.search(r"\bimport\b *[({'\"*]|\bfetch\(|WebSocket|XMLHttpRequest", text)
     assert "<title>gecko</title>" in text
@@ -460,3 +460,18 @@ def test_the_command_writes_pages_and_collections(tmp_path, capsys):
     ):
         assert main(["export-web", *words, "--out", str(collection)]) == 2
         assert error in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("urls", "links"),
+    [(None, 1), (["Repository, https://github.com/us/npa?a&b", "Home, https://x.example"], 2)],
+)
+def test_a_page_names_the_repository_only_where_it_is_known(monkeypatch, urls, links):
+    class Known:
+        def get_all(self, name):
+            return urls if name == "Project-URL" else None
+
+    monkeypatch.setattr(export, "metadata", lambda name: Known())
+    addresses = re.findall(r'<a href="([^"]*)"', page_text([], title="mine"))
+    ours = ["https://arxiv.org/abs/2601.16096", "https://github.com/us/npa?a&amp;b"]
+    assert addresses == ours[:links]

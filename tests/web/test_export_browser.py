@@ -67,6 +67,20 @@ def test_an_exported_page_lives_and_is_touched(exported):
     page.wait(f"{STEP} > {before} + 2")
 
 
+def test_a_phone_hears_what_the_page_is_and_chooses_a_rule_by_its_name(exported):
+    page = exported("gecko", "heart", particle_count=64, size=PHONE)
+    middle = "(({ x, y, width, height }) => [x + width / 2, y + height / 2])"
+    box = f"{middle}(document.querySelector('%s').getBoundingClientRect())"
+    page.touch([page.run(box % "#about summary")])
+    page.wait("document.getElementById('about').innerText.includes('only its neighbours')")
+    links = page.run("[...document.querySelectorAll('#about a')].map((link) => link.href)")
+    assert links[0] == "https://arxiv.org/abs/2601.16096"
+    x, y = page.run(box % "#title")
+    assert page.run(f"document.elementFromPoint({x}, {y}).id") == "choice"
+    page.run("(choice.value = 'heart', choice.dispatchEvent(new Event('change')))")
+    page.wait("document.getElementById('title').textContent === 'heart'")
+
+
 @pytest.mark.slow
 def test_a_page_records_a_film_and_a_picture(exported):
     page = exported("gecko", particle_count=256, steps=2)

@@ -22,6 +22,7 @@ from support.clock import wait_until
 
 from npa_envs import NPAError, load_rule, save_rule
 from npa_envs.rule.files import rule_metadata, shipped_rules
+from npa_envs.training.task_table import task_entry
 from npa_envs.web import dropped_file, training_session
 from npa_envs.web.dropped_file import read_dropped, stored_name
 from npa_envs.web.training_session import OLD, LearningWorld, Training
@@ -252,6 +253,16 @@ def test_a_learned_rule_stays_where_the_next_file_comes_at_once(tmp_path, monkey
 # With processes.
 
 
+@pytest.mark.parametrize(("device", "known"), [("cpu", True), ("cuda", False)])
+def test_the_page_hears_before_the_start_how_long_a_run_takes(tmp_path, monkeypatch, device, known):
+    monkeypatch.setattr(Training, "_call", lambda *_, **__: "")
+    training = Training(tmp_path, device=device, preset="fast")
+    training.begin("a.obj", b"1")
+    assert ended(training)["state"] == "done"
+    seconds = task_entry("morphogenesis3d").fast_seconds
+    assert training.report["expected"] == (seconds if known else None)
+
+
 def test_the_page_hears_in_words_what_the_child_refuses(tmp_path):
     training = Training(tmp_path)
     training.begin("holiday.jpg", png(noise=True))
@@ -388,8 +399,10 @@ def test_a_drop_is_watched_in_its_tab_and_offered_in_another(new_page, tmp_path)
         first.run("location.reload()")
         first.wait("document.page.world.title === 'disk.png'")
         first.run("(sessionStorage.clear(), location.reload())")
-        first.wait(f"document.page.frame.step > 1 && {says} === 'Watch disk.png'")
-        first.run("document.querySelector('#training button').click()")
+        entries = "[...document.querySelectorAll('#training button')].map((b) => b.textContent)"
+        first.wait(f"document.page.frame.step > 1 && {entries}.length === 2")
+        assert first.run(entries) == ["Grow your own picture", "Watch disk.png"]
+        first.run("document.querySelector('#training button:last-of-type').click()")
         first.wait(f"document.page.world.title === 'disk.png' && {says}.includes('Learned in')")
         first.run(f"document.body.{escape}")
         assert first.run(says) == "Grow your own picture"

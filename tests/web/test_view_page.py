@@ -254,6 +254,24 @@ def test_the_card_stops_a_training_once(shown):
 
 
 @pytest.mark.slow
+def test_the_card_shows_the_estimated_time_until_it_is_measured(shown):
+    page, _ = shown()
+    first, second, third = page.run("""(async () => {
+        const { TrainingCard } = await import("./training.js");
+        const card = new TrainingCard(() => {});
+        const event = { type: "training", id: "1", name: "a.png", expected: 220, total: 2400 };
+        return [
+            { state: "starting" }, { state: "learning", iteration: 10 },
+            { state: "learning", iteration: 50, seconds_left: 400 },
+        ].map((fields) => { card.listen({ ...event, ...fields }); return card.card.textContent; });
+    })()""")
+    assert "Starting the training, about 4 minutes on an idle CPU" in first
+    assert "Iteration 10 of 2400, about 4 minutes on an idle CPU" in second
+    assert "Iteration 50 of 2400, 7 minutes left" in third
+    assert ["next to nothing" in words for words in (first, second, third)] == [False, True, False]
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("painter", ["canvas", "webgl2"])
 def test_a_3d_world_turns_under_the_pointer(shown, painter, tmp_path):
     page, _ = shown("duck", 1024, query=f"?painter={painter}")

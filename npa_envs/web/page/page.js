@@ -449,7 +449,8 @@ class Controls {
     $("one").onclick = () => { page.play(false); page.send({ type: "step" }); };
     $("reset").onclick = () => page.send({ type: "reset" });
     $("fold").onclick = () => this.fold(!$("panel").hidden);
-    $("rule").onchange = () => page.send({ type: "set", name: "rule", value: $("rule").value });
+    for (const one of [$("rule"), $("choice")])
+      one.onchange = () => page.send({ type: "set", name: "rule", value: one.value });
     $("other").onchange = () => page.brushes.showHint();
     $("show").onchange = () => page.send({ type: "set", name: "show", value: $("show").value });
     $("message").onclick = () => ($("message").hidden = true);
@@ -476,7 +477,7 @@ class Controls {
     $("title").textContent = world.title;
     $("note").textContent = world.note;
     this.showPlaying();
-    options($("rule"), world.rules, world.rule);
+    for (const one of [$("rule"), $("choice")]) options(one, world.rules, world.rule);
     const other = world.others.includes($("other").value) && before.rule === world.rule
       ? $("other").value : world.others.find((name) => name !== world.rule);
     options($("other"), world.others, other);
@@ -486,7 +487,7 @@ class Controls {
     $("meaning").textContent = world.show === "colours" && classes.length
       ? `Which class each particle takes this for: ${classes.join(", ")}; grey where it is not sure.`
       : MEANINGS[world.show.split(" ")[0]];
-    $("rule-field").hidden = world.rules.length < 2;
+    $("rule-field").hidden = $("choice").hidden = world.rules.length < 2;
     $("other-field").hidden = !world.tools.some(({ takes }) => takes === "rule");
     $("brush").hidden = !world.tools.length;
     this.showBrushes();

@@ -125,9 +125,10 @@ export class TrainingCard {
 
   closed() {
     const { id, state, name, has_rule, iteration = 0, total = Infinity } = this.event, active = ACTIVE.includes(state);
-    if (!active && has_rule && this.showing !== id) return [button(`Watch ${name}`, () => this.show())];
+    const watch = !active && has_rule && this.showing !== id ? [button(`Watch ${name}`, () => this.show())] : [];
     const share = `Learning ${name}: ${Math.floor((100 * iteration) / total)} %`;
-    return [button(active ? share : "Grow your own picture", () => this.change({ open: true, choosing: !active }))];
+    const open = () => this.change({ open: true, choosing: !active });
+    return [button(active ? share : "Grow your own picture", open), ...watch];
   }
 
   empty() {
@@ -145,20 +146,22 @@ export class TrainingCard {
   }
 
   active() {
-    const { id, name, note, state, iteration = 0, total, has_rule, seconds_left: left } = this.event;
+    const { id, name, note, state, iteration = 0, total, has_rule, expected, seconds_left: left } = this.event;
     const bar = make("progress", { max: total ?? 1 });
     if (total) bar.value = iteration;
+    const guess = expected ? `, about ${duration(expected)} on an idle CPU` : "";
     const words = {
-      reading: "Reading the file…", starting: "Starting the training…",
-      learning: `Iteration ${iteration} of ${total}${left === undefined ? "" : `, ${duration(left)} left`}`,
+      reading: "Reading the file…", starting: `Starting the training${guess}…`,
+      learning: `Iteration ${iteration} of ${total}${left === undefined ? guess : `, ${duration(left)} left`}`,
     };
+    const unlearned = state === "learning" && iteration < total / 50 ? "The rule has learned next to nothing yet." : "";
     const stopping = this.stopping === id, stop = button("Stop", () => {
       this.send({ type: "training", action: "stop" });
       this.change({ stopping: id });
     });
     return [
       this.heading(`Learning ${name}`), bar, ...this.target(),
-      text(stopping ? "Stopping; what it has learned is saved…" : words[state]), text(note),
+      text(stopping ? "Stopping; what it has learned is saved…" : words[state]), text(unlearned), text(note),
       row(this.quality(), ...(has_rule && this.showing !== id ? [this.watch()] : []), ...(stopping ? [] : [stop])),
     ];
   }
