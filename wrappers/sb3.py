@@ -303,12 +303,12 @@ class WorldVecEnv(_EpisodeRows):
     def __init__(self, env: Any) -> None:
         if not hasattr(env, "single_action_space"):
             raise NPAError(f"env must be a vector environment, got {env}: {MAKE_VECTOR}")
-        if hasattr(env, "possible_agents"):
+        ours = isinstance(env.unwrapped, NPAVectorEnv)
+        if ours and hasattr(env, "possible_agents"):
             raise NPAError(
                 f"env must have one agent, got {type(env).__name__} with {env.possible_agents}: "
                 "let one learn in gym.make_vec('npa/Gardener2D-v0'), or step both by hand"
             )
-        ours = isinstance(env.unwrapped, NPAVectorEnv)
         made = "" if ours else "vectorization_mode='vector_entry_point', "
         check_autoreset(autoreset_mode(env), "same-step", made)
         super().__init__(
