@@ -20,7 +20,7 @@ SCORES: Mapping[str, tuple[str, str, str, str]] = {
         "growth", "psnr", ".1f", "PSNR [dB] of views that training never saw, higher is better",
     ),
     "texture": (
-        "judge", "ratio", ".2f", "distance from the target, lower is better; 1: a quarter of it",
+        "judge", "ratio", ".2f", "distance from the target, lower is better",
     ),
     "point_classification": ("accuracy", "majority", ".1%", "share of digits that are recognised"),
 }  # fmt: skip
