@@ -192,9 +192,19 @@ def products(rows: Tensor, weights: Tensor) -> Tensor:
     return torch.stack([table @ weights for table in tables])
 
 
+def in_order(values: Tensor) -> Tensor:
+    """Return values [..., M] rising along M."""
+    if values.is_cuda or values.requires_grad:
+        return values.contiguous().sort(dim=-1).values
+    # NumPy finds no indices, which only gradients need: many times faster.
+    ordered = values.clone(memory_format=torch.contiguous_format)
+    ordered.numpy().sort(axis=-1)
+    return ordered
+
+
 def quantiles(values: Tensor, count: int) -> Tensor:
     """Return evenly spaced quantiles of each row of values [F, M], rising, shape [F, count]."""
-    ordered = values.sort(dim=1).values
+    ordered = in_order(values)
     total = ordered.shape[1]
     if total == count:
         return ordered
@@ -203,16 +213,6 @@ def quantiles(values: Tensor, count: int) -> Tensor:
     low = position.floor().long()
     part = position - low
     return ordered[:, low] * (1.0 - part) + ordered[:, (low + 1).clamp(max=total - 1)] * part
-
-
-def in_order(values: Tensor) -> Tensor:
-    """Return values [..., M] rising along M."""
-    ordered = values.clone(memory_format=torch.contiguous_format)
-    if ordered.is_cuda or ordered.requires_grad:
-        return ordered.sort(dim=-1).values
-    # NumPy finds no indices, which only gradients need: many times faster.
-    ordered.numpy().sort(axis=-1)
-    return ordered
 
 
 # Sliced Wasserstein distances. A texture is described, at each image size, by its patches in a
