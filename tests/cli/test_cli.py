@@ -377,13 +377,13 @@ MISTAKES = [
 ]
 
 
-def test_cures_are_spelled_as_one_types_them(trained, capsys, monkeypatch):
+def test_cures_name_what_the_shell_and_python_have_in_common(trained, capsys, monkeypatch):
     words = ["train", *TINY, "--milestones", "--resume", "--out", str(trained)]
-    cure = f"a new run in another folder, from this rule with --initial-rule '{trained}'"
+    cure = f"a new run in another folder, with the initial rule '{trained}'"
     assert cure in error_of(capsys, [*words, "--iterations", "9"])
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     message = error_of(capsys, ["evaluate", "gecko", "--device", "cuda"])
-    assert "sees 0 CUDA devices: leave out --device, or see" in message
+    assert "sees 0 CUDA devices: use 'cpu', or see" in message
 
 
 @pytest.mark.parametrize(("words", "message"), MISTAKES)
