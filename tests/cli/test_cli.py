@@ -290,7 +290,10 @@ def test_runs_that_name_no_preset_take_the_best_one_on_cuda_and_the_fast_one_els
     first = common.first_options(rest)
     assert starting_configuration(task, first) == preset(name, task)
     options, config = parse_run(task, first)
-    assert announcement(task, options, config)[0].endswith(f"(preset {name})")
+    line = announcement(task, options, config, words.split())[0]
+    assert line.endswith(f"(preset {name})")
+    assert ("no --target" in line) is (task != "point_classification")
+    assert "no --target" not in announcement(task, options, config, ["--targets=a"])[0]
 
 
 def test_a_configuration_file_goes_over_the_preset_and_options_over_the_file(tmp_path, capsys):
