@@ -2,8 +2,8 @@
 
     python docs/scripts/draw_rules.py [--only {2d,3d,textures,presets} ...]
 
-It takes some minutes on a CPU, textures half an hour. Draw anew when a rule changes. `presets` needs
-a run of `npa-envs train morphogenesis2d --target NAME --out runs/fast/NAME` for each of its names.
+It takes some minutes on a CPU, textures half an hour. Draw anew when a rule changes. `presets`
+needs runs: `npa-envs train morphogenesis2d --target NAME --out runs/fast/NAME`, for three names.
 """
 
 from __future__ import annotations

@@ -59,7 +59,7 @@ FILM_STEPS = 512
 TITLES: Mapping[str, str] = {
     "healing": "After damage:",
     "pictures": "Each picture by its own code, and by that of the next one, shuffled:",
-    "judge": "Distances that no loss uses; from the target to a quarter of it would be 1:",
+    "judge": "Distances that no loss uses; 1: between a quarter of the target and the whole:",
     "changes": "Some steps after a change of the clouds:",
 }
 """Lines above tables of a model card."""
