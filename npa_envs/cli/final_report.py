@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 import json
 import math
-import re
 import shlex
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields
@@ -258,16 +257,15 @@ def next_steps(
         and shortfalls({"healing": tables.get("healing", ())})
     ):
         usual = ["usual for `fast`; `best`, which `--device cuda` takes, heals most wounds"]
-    run = path.parent
+    run = str(path.parent)
     failing = words or shortfalls({"growth": tables.get("growth", ())})
     if path.name != "rule.safetensors" or not failing:
         return usual, ""
-    number = re.search(r"\d*$", run.name)[0]
-    stem = run.name.removesuffix(number)
-    outs = (run.with_name(f"{stem}{k}") for k in itertools.count(int(number or 1) + 1))
-    out = next(folder for folder in outs if not folder.exists())
-    words = ["--config", f"{run}/config.json", "--initial-rule", str(run), *words]
-    return usual, shlex.join(["npa-envs", "train", task_name, *words, "--out", str(out)])
+    stem = run.rstrip("0123456789")
+    outs = (f"{stem}{k}" for k in itertools.count(int(run.removeprefix(stem) or 1) + 1))
+    words = ["--config", f"{run}/config.json", "--initial-rule", run, *words]
+    words += ["--out", next(out for out in outs if not Path(out).exists())]
+    return usual, shlex.join(["npa-envs", "train", task_name, *words])
 
 
 def _model_card(
