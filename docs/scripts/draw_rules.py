@@ -75,11 +75,13 @@ def presets() -> Shots:
     """Return each target, and step 512 of its rules by the presets `fast` and `best`."""
     shots: Shots = []
     for name in ("gecko", "butterfly", "octopus"):
-        shots += moments(name, ())
+        row: Shots = []
         for preset, source in (("fast", f"runs/fast/{name}"), ("best", name)):
             task, ((x, s),) = grown(source, (512,))
-            large = task_for_film(task, source, npa_envs.load_rule(source), CPU, least=256)
-            shots.append((preset, to_uint8(large.picture(x, s)[0])))
+            rule = npa_envs.load_rule(source)
+            task = task_for_film(task, source, rule, CPU, least=0, resolution=176)
+            row.append((preset, to_uint8(task.picture(x, s)[0])))
+        shots += [(name, to_uint8(task.target_picture)), *row]
     return shots
 
 
