@@ -76,7 +76,7 @@ def test_environments_of_ones_own_are_viewed(tmp_path, monkeypatch):
         (["npa/Texture-v0", "--policy", "duck"], "the environment's space_dim, 2, got 3"),
         (["npa/Texture-v0", "--policy", "gecko"], "got 0.1: say --keywords eps0=0.1"),
         (["npa/Texture-v0", "--policy", "digits"], "got one of static particles"),
-        (["nowhere.safetensors"], "the file 'nowhere.safetensors' does not exist"),
+        (["nowhere.safetensors"], "'nowhere.safetensors': it does not exist"),
         (["gecko", "--policy", "random"], "policy is for environments"),
         (["gecko", "--keywords", "eps=0.2"], "keywords is for environments"),
         (["npa/Texture-v0", "--keywords", "eps"], "keywords must be NAME=VALUE, got 'eps'"),
