@@ -194,7 +194,7 @@ def check_device(name: str | torch.device) -> torch.device:
     if index >= count:
         raise NPAError(
             f"device must be one that torch sees, got {shown(str(name))}, but it sees {count} CUDA "
-            "devices: use device='cpu', or see `npa-envs doctor`"
+            "devices: use 'cpu', or see `npa-envs doctor`"
         )
     return torch.device("cuda", index)
 
@@ -459,8 +459,7 @@ def check_fraction(config: object, *names: str) -> None:
 
 def check_word(config: object, name: str, choices: Sequence[str | None]) -> None:
     """Check that a field is one of `choices`, which may include None."""
-    value, known = getattr(config, name), [choice for choice in choices if choice is not None]
-    check_field(config, name, value in choices, "be a known word", suggest(value, known))
+    checked_choice(name, getattr(config, name), choices)
 
 
 def check_flag(config: object, *names: str) -> None:

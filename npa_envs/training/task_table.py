@@ -216,7 +216,7 @@ def load_config(
     """
     path = checked_path(path)
     try:
-        text = read_bytes(path, limit=MAX_FILE).decode("utf-8")
+        text = read_bytes(path, limit=MAX_FILE, what="it").decode("utf-8")
     except (NPAError, UnicodeDecodeError) as error:
         raise NPAError(f"cannot read the configuration file {shown(str(path))}: {error}") from error
     parse = PARSERS.get(path.suffix.lower())

@@ -451,8 +451,8 @@ def initial_rule(config: TrainConfig[Any], untrained: NPARule) -> NPARule:
     if differences:
         raise NPAError(
             f"initial_rule must be a rule of the task's shape, but {shown(source)} differs in "
-            f"{differences}: change those fields, start from another rule, or from random weights "
-            "(initial_rule='')"
+            f"{differences}: change those fields, start from another rule, or from random weights, "
+            "with the initial rule ''"
         )
     return rule
 

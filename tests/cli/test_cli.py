@@ -290,7 +290,10 @@ def test_runs_that_name_no_preset_take_the_best_one_on_cuda_and_the_fast_one_els
     first = common.first_options(rest)
     assert starting_configuration(task, first) == preset(name, task)
     options, config = parse_run(task, first)
-    assert announcement(task, options, config)[0].endswith(f"(preset {name})")
+    line = announcement(task, options, config, words.split())[0]
+    assert line.endswith(f"(preset {name})")
+    assert ("no --target" in line) is (task != "point_classification")
+    assert "no --target" not in announcement(task, options, config, ["--targets=a"])[0]
 
 
 def test_a_configuration_file_goes_over_the_preset_and_options_over_the_file(tmp_path, capsys):
@@ -377,13 +380,13 @@ MISTAKES = [
 ]
 
 
-def test_cures_are_spelled_as_one_types_them(trained, capsys, monkeypatch):
+def test_cures_name_what_the_shell_and_python_have_in_common(trained, capsys, monkeypatch):
     words = ["train", *TINY, "--milestones", "--resume", "--out", str(trained)]
-    cure = f"a new run in another folder, from this rule with --initial-rule '{trained}'"
+    cure = f"a new run in another folder, with the initial rule '{trained}'"
     assert cure in error_of(capsys, [*words, "--iterations", "9"])
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     message = error_of(capsys, ["evaluate", "gecko", "--device", "cuda"])
-    assert "sees 0 CUDA devices: leave out --device, or see" in message
+    assert "sees 0 CUDA devices: use 'cpu', or see" in message
 
 
 @pytest.mark.parametrize(("words", "message"), MISTAKES)

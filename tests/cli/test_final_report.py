@@ -17,7 +17,7 @@ from npa_envs.measure import quality
 from npa_envs.measure.quality import AccuracyRow, EvaluationRow, HealingRow, PictureRow
 from npa_envs.measure.wounds import WoundRow
 from npa_envs.render import world_film
-from npa_envs.training import TASKS
+from npa_envs.training import TASKS, preset
 from npa_envs.training.trainer import JOINT_TASK_NAME
 
 
@@ -128,12 +128,34 @@ def test_a_report_says_where_worlds_do_not_hold(factor, holds, tmp_path, capsys,
     assert (said in output) is not holds
     commands = re.findall("train on: npa-envs (.*)", output)
     card = (tmp_path / "run" / "report" / "rule.md").read_text("utf-8")
-    assert ("To train on:" in card) is bool(commands)
-    assert commands or holds
-    for command in commands:
-        assert f"npa-envs {command}\n" in card
-        assert main([*command.split(), "--no-progress", "--no-report"]) == 0
-        assert (tmp_path / "run2" / "rule.safetensors").exists()
+    assert "- 2 iterations of the 40 of the preset `tiny`." in card
+    (command,) = commands
+    assert f"To train on:\n\n```sh\nnpa-envs {command}\n" in card
+    assert main([*command.split(), "--no-progress", "--no-report"]) == 0
+    assert "finished: 40 iterations" in capsys.readouterr().out
+    assert (tmp_path / "run2" / "rule.safetensors").exists()
+
+
+def test_a_report_names_the_next_step_of_short_runs_and_what_is_usual_for_the_preset(tmp_path):
+    path, task = tmp_path / "lizard2" / "rule.safetensors", "morphogenesis2d"
+    short = preset("fast", task, target="heart", iterations=60)
+    usual, command = report.next_steps(path, task, short, {})
+    assert usual == ["60 iterations of the 2400 of the preset `fast`"]
+    assert command.endswith(f"--iterations 2400 --out {tmp_path / 'lizard3'}")
+    (tmp_path / "lizard3").mkdir()
+    assert report.next_steps(path, task, short, {})[1].endswith("lizard4")
+    tables = {"healing": [WoundRow("wipe, radius 0.2", 6, 6, 0, 0.1, 1.0, 0.3, scars="top")]}
+    (usual,), command = report.next_steps(path, task, preset("fast", task), tables)
+    assert (usual[:17], command) == ("usual for `fast`;", "")
+    assert report.next_steps(path, task, preset("best", task), tables) == ([], "")
+    assert report.next_steps(path, task, preset("fast", task), {}) == ([], "")
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_a_configuration_is_taken_for_the_preset_that_it_was_made_of(task):
+    for name in TASKS[task].presets:
+        config = preset(name, task, iterations=2, milestones=(), seed=5, device="cuda")
+        assert report.nearest_preset(task, config) == name
 
 
 def test_a_rule_that_cannot_be_measured_is_kept_and_said_to_have_no_report(
