@@ -50,7 +50,7 @@ class LiveWorld(ABC):
         """Return the event "world"; subclasses add the fields of their worlds."""
         ranges = self._ranges()
         values = {name: getattr(self, name) for name in ranges}
-        trained = values | self._trained_values
+        trained = {**values, **self._trained_values}
         return {
             "type": "world",
             "tools": [{"name": name} | brush._asdict() for name, brush in self.brushes.items()],

@@ -126,7 +126,7 @@ def test_a_page_begins_with_a_brush_that_heals_and_says_what_it_does(run):
     assert shown == [["wipe", wiping], 10, ["remove", removing], "look"]
 
 
-def test_another_world_begins_with_wipe_unless_another_brush_is_chosen_and_is_asked_for_its_loss(run):
+def test_another_world_begins_with_wipe_or_the_chosen_brush_and_is_asked_for_its_loss(run):
     brushes, losses, curves = run("""
         const mine = { ...world, title: "mine", capabilities: ["film"] };
         const learned = { ...mine, capabilities: ["film", "loss"] };

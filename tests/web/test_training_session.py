@@ -296,10 +296,10 @@ def test_a_world_takes_later_rules_and_begins_once_more_at_the_end(learning):
 
 def test_a_world_is_called_by_its_picture_and_has_a_loss_once_it_has_learned(learning):
     world, training, _ = learning
-    shown = world.describe()
-    assert (shown["title"], shown["others"], shown["species"]) == (("heart.png"), *[["heart.png"]] * 2)
+    shown, name = world.describe(), "heart.png"
+    assert (shown["title"], shown["others"], shown["species"]) == (name, [name], [name])
     assert shown["capabilities"] == ["film"]
-    add = {"type": "brush", "tool": "add", "at": [0.5, 0.0], "radius": 0.1, "rule": "heart.png"}
+    add = {"type": "brush", "tool": "add", "at": [0.5, 0.0], "radius": 0.1, "rule": name}
     world.handle(add)
     assert len(world.particles.x[0]) > world.count
     world.take_events()
