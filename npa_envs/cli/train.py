@@ -59,9 +59,10 @@ class TrainOptions(common.SharedRunOptions):
     """How a run starts and ends."""
 
     preset: str = ""
-    """Configuration to start from: `paper`, `fast` (minutes on a CPU), `tiny` (seconds), or for
-    pictures and textures `best` (minutes on a GPU); `npa-envs list` prints sizes and times. By
-    default `best` on CUDA if the task has it, else `fast`."""
+    """Configuration to start from: `paper`, `fast` (minutes on a CPU), `tiny` (seconds), for
+    pictures and textures `best` (minutes on a GPU), or for pictures with thin lines `detail`;
+    `npa-envs list` prints sizes and times. By default `best` on CUDA if the task has it, else
+    `fast`."""
     config: Path | None = None
     """YAML, TOML or JSON file of fields and values, also `preset`; overrides the preset."""
     max_seconds: float = math.inf

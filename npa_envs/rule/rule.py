@@ -508,8 +508,8 @@ def _has_backward_hooks(module: nn.Module) -> bool:
 
 
 @torch.no_grad()
-def with_codes(rule: NPARule, untrained: NPARule) -> NPARule:
-    """Copy the weights of a rule without codes into an untrained rule with codes, and return that.
+def enlarged(rule: NPARule, untrained: NPARule) -> NPARule:
+    """Copy the weights of a rule without codes into an untrained, larger one, and return that.
 
     The columns of the code and additional hidden units keep their untrained weights. Where the
     shapes do not fit, nothing is copied and `rule` is returned.
