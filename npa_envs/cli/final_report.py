@@ -229,13 +229,17 @@ def shortfalls(tables: Mapping[str, Sequence[Any]]) -> list[str]:
 
 def nearest_preset(task_name: str, config: TrainConfig[Any]) -> str:
     """Return the preset from which a configuration differs in the fewest fields."""
-    values = config_to_dict(config)
 
-    def differences(name: str) -> int:
-        of_preset = config_to_dict(task_entry(task_name).presets[name])
-        return sum(values[key] != value for key, value in of_preset.items())
+    def fields_of(config: TrainConfig[Any]) -> dict[str, Any]:
+        values = config_to_dict(config)
+        return {**values.pop("task"), **values}
 
-    return min(task_entry(task_name).presets, key=differences)
+    presets, values = task_entry(task_name).presets, fields_of(config)
+    shared = {
+        name: sum(values[key] == value for key, value in fields_of(one).items())
+        for name, one in presets.items()
+    }
+    return max(shared, key=shared.__getitem__)
 
 
 def next_steps(
