@@ -230,13 +230,12 @@ def _shared_palette(pictures: list[Frame]) -> tuple[Image.Image, Frame, int]:
     sample = np.concatenate([p.reshape(-1, 3)[k % step :: step] for k, p in enumerate(pictures)])
     coarse = (sample >> 3) @ np.array([1024, 32, 1])
     counts = np.bincount(coarse)
-    used = counts.nonzero()
-    means = [np.bincount(coarse, weights=sample[:, k])[used] / counts[used] for k in range(3)]
+    means = [np.bincount(coarse, sample[:, k]) / np.maximum(counts, 1) for k in range(3)]
     shades = sample[coarse == counts.argmax()]
     fine = (shades & 7) @ np.array([64, 8, 1])
     background = shades[(fine == np.bincount(fine).argmax()).argmax()]
     # Weighted by roots of counts: otherwise a large background takes most of the palette.
-    repeats = np.ceil(np.sqrt(counts[used])).astype(np.int64)
+    repeats = np.ceil(np.sqrt(counts)).astype(np.int64)
     swatch = np.repeat(np.stack(means, axis=1).round().astype(np.uint8), repeats, axis=0)[None]
     palette = Image.fromarray(swatch).quantize(
         colors=255, method=Image.Quantize.MEDIANCUT, kmeans=2, dither=Image.Dither.NONE
