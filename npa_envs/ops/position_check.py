@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import functools
-import itertools
 import os
 import threading
 import time
@@ -64,7 +63,7 @@ class PositionCheck:
     """
 
     def __init__(self, x: Tensor) -> None:
-        self._x, self._slow = x, FiniteCheck(x) if _is_slow(x) else None
+        self._x, self._slow = x, FiniteCheck(x) if is_slow(x) else None
         if self._slow is not None:
             if not x.is_cuda:
                 self._slow.wait()
@@ -73,13 +72,16 @@ class PositionCheck:
         if reports is None:
             reports = torch.zeros(THREADS, dtype=torch.uint8, device="cpu", pin_memory=x.is_cuda)
             _host.reports[x.device] = reports
-        self._address = reports.data_ptr()
         # A check before this one that nobody has waited for, after an error, reports other words.
         _host.checks = _host.checks % CHECKS + 1
-        self._finite = 2 * _host.checks
-        # It writes to the host's memory: a copy and an event would take more CPU time.
-        kernel = report_finite(SCALARS[x.dtype])
-        launch(kernel, THREADS, x.device, THREADS, self._finite, self._x, reports)
+        self._reports, self._finite = reports, 2 * _host.checks
+        self.begin()
+
+    def begin(self) -> None:
+        """Launch the threads' reports."""
+        # They write to the host's memory: a copy and an event would take more CPU time.
+        kernel = report_finite(SCALARS[self._x.dtype])
+        launch(kernel, THREADS, self._x.device, THREADS, self._finite, self._x, self._reports)
 
     def __enter__(self) -> None:
         """Begin the block that `checked_positions` describes."""
@@ -92,23 +94,41 @@ class PositionCheck:
         """Wait for the check, not for work after it; raise NPAError if a position is not finite."""
         if self._slow is not None:
             self._slow.wait()
-            return
-        words = bytes([self._finite]), bytes([self._finite + 1])
-        for reads in itertools.count(1):
-            reports = ctypes.string_at(self._address, THREADS)
-            finite, not_finite = map(reports.count, words)
-            if finite == THREADS:
-                return
-            if finite + not_finite == THREADS:
-                break
+        elif not self.is_finite():
+            FiniteCheck(self._x).wait()
+
+    def is_finite(self) -> bool:
+        """Wait for all threads' reports; return whether all positions are finite."""
+        address, word, reads = self._reports.data_ptr(), self._finite, 0
+        finite = bytes([word]) * THREADS
+        while (reports := ctypes.string_at(address, THREADS)) != finite:
+            if reports.count(word) + reports.count(word + 1) == THREADS:
+                return False
+            reads += 1
             # It raises the device's error, if there is one.
             if reads % QUERY_INTERVAL == 0 and torch.cuda.current_stream(self._x.device).query():
-                break
+                return False
             if reads > PATIENT_READS:
                 _let_others_run()
-        FiniteCheck(self._x).wait()
+        return True
 
 
-def _is_slow(x: Tensor) -> bool:
+class CapturedCheck(PositionCheck):
+    """A check that a CUDA graph begins in each replay, with `reports` of its own, pinned memory.
+
+    `restart` comes before each replay.
+    """
+
+    def __init__(self, x: Tensor, reports: Tensor) -> None:
+        self._x, self._slow = x, None
+        self._reports, self._finite = reports.fill_(1), 1
+
+    def restart(self) -> None:
+        """Forget the reports of the last replay, which after an error nobody has waited for."""
+        self.is_finite()
+        ctypes.memset(self._reports.data_ptr(), 0, THREADS)
+
+
+def is_slow(x: Tensor) -> bool:
     """Return whether torch checks positions: on a CPU, or if they are many or in any places."""
     return not (x.is_cuda and x.numel() <= MAX_NUMBERS and x.is_contiguous() and is_aligned(x))

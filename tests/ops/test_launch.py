@@ -143,7 +143,7 @@ def test_a_check_of_positions_waits_for_late_reports(monkeypatch):
     def launch_later(*arguments):
         threading.Timer(0.05, lambda: late.append(1) or report(*arguments)).start()
 
-    monkeypatch.setattr(position_check, "_is_slow", lambda x: False)
+    monkeypatch.setattr(position_check, "is_slow", lambda x: False)
     monkeypatch.setattr(position_check, "launch", launch_later)
     with position_check.checked_positions(torch.zeros(1, 4, 2)):
         assert not late
@@ -155,7 +155,7 @@ def test_a_check_of_positions_waits_for_late_reports(monkeypatch):
 def test_positions_that_are_not_finite_are_refused_by_all_checks(size, fast, device, monkeypatch):
     if fast:
         # On a CPU as well, threads report.
-        monkeypatch.setattr(position_check, "_is_slow", lambda x: False)
+        monkeypatch.setattr(position_check, "is_slow", lambda x: False)
     x, s = random_world(1, size, 2, 1, dtype=torch.float32, device=device)
     # Beside a multiple of what a thread reads at once.
     for k in {0, size // 3, size - 1}:
