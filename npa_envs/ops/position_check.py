@@ -19,29 +19,25 @@ from npa_envs.ops.launch import SCALARS, is_aligned, launch
 THREADS = 2048
 """Threads that check positions."""
 
+ALL_FINITE = bytes([1]) * THREADS
+"""Their reports if all positions are finite."""
+
 MAX_NUMBERS = 2**18
 """Maximum number of coordinates that they check; work on more hides torch's slower check."""
 
 PATIENT_READS, QUERY_INTERVAL = 64, 2**17
 """Reads of all reports after which the host lets others run, and asks if the stream has failed."""
 
-CHECKS = 100
-"""Number of checks of a thread after which devices report the same words again."""
-
-
 # On Linux a sleep of no time takes 50 µs.
 _let_others_run = getattr(os, "sched_yield", functools.partial(time.sleep, 0.0))
 
 
-class _Host(threading.local):
-    """A thread's memory for reports by device, and its number of checks."""
-
-    def __init__(self) -> None:
-        self.reports: dict[torch.device, Tensor] = {}
-        self.checks = 0
+def _new_reports(device: torch.device, _thread: int = 0) -> Tensor:
+    """Return memory of the host that a device's threads write to: 1 if positions are finite."""
+    return torch.ones(THREADS, dtype=torch.uint8, device="cpu", pin_memory=device.type == "cuda")
 
 
-_host = _Host()
+_reports_of = functools.cache(_new_reports)
 
 
 def checked_positions(x: Tensor) -> contextlib.AbstractContextManager[object]:
@@ -59,29 +55,34 @@ class PositionCheck:
     """A check that all positions are finite: it starts when it is made, and `wait` raises.
 
     On CUDA it is on the current stream, so that `wait` waits only for earlier work. x must not
-    change until then, and a thread waits for one check before it makes another.
+    change until then, and a thread waits for one check before it makes another. A `captured` check
+    starts with each replay of the CUDA graph that calls `begin`, after `restart`.
     """
 
-    def __init__(self, x: Tensor) -> None:
-        self._x, self._slow = x, FiniteCheck(x) if is_slow(x) else None
-        if self._slow is not None:
+    def __init__(self, x: Tensor, *, captured: bool = False) -> None:
+        self._x = x
+        self._slow: FiniteCheck | None = None
+        if captured:
+            self._reports = _new_reports(x.device)
+        elif is_slow(x):
+            self._slow = FiniteCheck(x)
             if not x.is_cuda:
                 self._slow.wait()
-            return
-        reports = _host.reports.get(x.device)
-        if reports is None:
-            reports = torch.zeros(THREADS, dtype=torch.uint8, device="cpu", pin_memory=x.is_cuda)
-            _host.reports[x.device] = reports
-        # A check before this one that nobody has waited for, after an error, reports other words.
-        _host.checks = _host.checks % CHECKS + 1
-        self._reports, self._finite = reports, 2 * _host.checks
-        self.begin()
+        else:
+            self._reports = _reports_of(x.device, threading.get_ident())
+            self.restart()
+            self.begin()
+
+    def restart(self) -> None:
+        """Forget the last reports, for which after an error nobody has waited."""
+        self._are_finite()
+        ctypes.memset(self._reports.data_ptr(), 0, THREADS)
 
     def begin(self) -> None:
         """Launch the threads' reports."""
         # They write to the host's memory: a copy and an event would take more CPU time.
         kernel = report_finite(SCALARS[self._x.dtype])
-        launch(kernel, THREADS, self._x.device, THREADS, self._finite, self._x, self._reports)
+        launch(kernel, THREADS, self._x.device, THREADS, 1, self._x, self._reports)
 
     def __enter__(self) -> None:
         """Begin the block that `checked_positions` describes."""
@@ -94,15 +95,14 @@ class PositionCheck:
         """Wait for the check, not for work after it; raise NPAError if a position is not finite."""
         if self._slow is not None:
             self._slow.wait()
-        elif not self.is_finite():
+        elif not self._are_finite():
             FiniteCheck(self._x).wait()
 
-    def is_finite(self) -> bool:
+    def _are_finite(self) -> bool:
         """Wait for all threads' reports; return whether all positions are finite."""
-        address, word, reads = self._reports.data_ptr(), self._finite, 0
-        finite = bytes([word]) * THREADS
-        while (reports := ctypes.string_at(address, THREADS)) != finite:
-            if reports.count(word) + reports.count(word + 1) == THREADS:
+        address, reads = self._reports.data_ptr(), 0
+        while (reports := ctypes.string_at(address, THREADS)) != ALL_FINITE:
+            if 0 not in reports:
                 return False
             reads += 1
             # It raises the device's error, if there is one.
@@ -111,22 +111,6 @@ class PositionCheck:
             if reads > PATIENT_READS:
                 _let_others_run()
         return True
-
-
-class CapturedCheck(PositionCheck):
-    """A check that a CUDA graph begins in each replay, with `reports` of its own, pinned memory.
-
-    `restart` comes before each replay.
-    """
-
-    def __init__(self, x: Tensor, reports: Tensor) -> None:
-        self._x, self._slow = x, None
-        self._reports, self._finite = reports.fill_(1), 1
-
-    def restart(self) -> None:
-        """Forget the reports of the last replay, which after an error nobody has waited for."""
-        self.is_finite()
-        ctypes.memset(self._reports.data_ptr(), 0, THREADS)
 
 
 def is_slow(x: Tensor) -> bool:

@@ -14,15 +14,9 @@ from torch import Tensor
 
 from npa_envs.errors import NPAError
 from npa_envs.ops.custom_op import once_differentiable
-from npa_envs.ops.position_check import THREADS, CapturedCheck, PositionCheck, is_slow
+from npa_envs.ops.position_check import PositionCheck, is_slow
 from npa_envs.rule.rule import NPARule
-from npa_envs.world.cuda_graph import (
-    GraphSequence,
-    capture,
-    current_stream,
-    pinned_like,
-    prepare_capture,
-)
+from npa_envs.world.cuda_graph import GraphSequence, capture, current_stream, prepare_capture
 from npa_envs.world.particles import Particles, combined
 from npa_envs.world.randomness import (
     Randomness,
@@ -117,12 +111,9 @@ class CapturedRollout:
             lambda value: torch.empty(value.shape, dtype=value.dtype, device=value.device)
         )
         self._inputs = [*self._worlds.tensors(), *itertools.chain.from_iterable(weights)]
-        self._check: CapturedCheck | None = None
+        fixed = self._worlds.x.detach()
+        self._check = None if is_slow(fixed) else PositionCheck(fixed, captured=True)
         """The check of positions that the graphs make; None: each call makes one."""
-        if not is_slow(self._worlds.x):
-            self._check = CapturedCheck(
-                self._worlds.x.detach(), pinned_like(torch.empty(THREADS, dtype=torch.uint8))
-            )
         self._grad_flags = call.grad_flags or (False,) * len(self._inputs)
         self.differentiable = any(self._grad_flags)
         """Whether backward passes are captured."""
@@ -312,7 +303,14 @@ class CapturedRollout:
                 worlds = Particles(*self.forward(steps, inputs, generator))
             if not results:
                 # Only now, when the device has work.
-                self._wait_for(check, generator, steps)
+                try:
+                    check.wait()
+                except NPAError:
+                    if self._streams is None:
+                        count = steps * self._draws_per_step
+                        source = torch_generator(generator, self.device)
+                        give_back_draws(source, self._generator.get_offset() - count, count)
+                    raise
             if self._streams is not None:
                 assert isinstance(generator, WorldRandom)
                 generator.sync_with(self._streams, steps)
@@ -330,17 +328,6 @@ class CapturedRollout:
         if call.spec.keep_every is None or len(results) == 1:
             return results[-1]
         return combined(torch.cat, results)
-
-    def _wait_for(self, check: PositionCheck, generator: Randomness | None, steps: int) -> None:
-        """Raise NPAError, with the generator as before the replay, unless positions are finite."""
-        try:
-            check.wait()
-        except NPAError:
-            if self._streams is None:
-                count = steps * self._draws_per_step
-                source = torch_generator(generator, self.device)
-                give_back_draws(source, self._generator.get_offset() - count, count)
-            raise
 
     def forward(
         self, steps: int, tensors: Sequence[Tensor], generator: Randomness | None

@@ -45,7 +45,6 @@ def replays(monkeypatch):
     monkeypatch.setattr(captured_rollout, "_views", lambda tensors: tensors)
     # As on CUDA, the graph checks positions, and its threads report.
     monkeypatch.setattr(captured_rollout, "is_slow", lambda x: False)
-    monkeypatch.setattr(captured_rollout, "pinned_like", lambda tensor: tensor)
     monkeypatch.setattr(cls, "_warm_up", warm_up)
     monkeypatch.setattr(cls, "_wait_for_last_use", lambda rollout: None)
     monkeypatch.setattr(capture_cache, "_may_capture", lambda x: True)
