@@ -541,7 +541,7 @@ class _Repeat:
         self._several = None if isinstance(results, Tensor) else type(results)
         made: list[Tensor] = [results] if self._several is None else [*results]
         self._makes = [
-            functools.partial(torch.empty, each.shape, dtype=each.dtype, device=each.device)
+            functools.partial(torch.empty, (*each.shape,), dtype=each.dtype, device=each.device)
             for each in made
         ]
         self._launches, self._block_bytes = recorded.launches, 0

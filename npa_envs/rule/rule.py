@@ -501,7 +501,7 @@ HYPER_PARAMETERS = {k: v for k, v in get_type_hints(NPARule.__init__).items() if
 
 
 def is_altered(module: nn.Module, *, backward: bool = False) -> bool:
-    """Return whether a module has a `forward` of its own or hooks, with `backward` those as well."""
+    """Return whether a module has its own `forward`, or hooks; with `backward`, also those."""
     own = module.__dict__
     if backward and (own["_backward_hooks"] or own["_backward_pre_hooks"]):
         return True
