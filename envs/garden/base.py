@@ -110,7 +110,7 @@ class GardenTask(RuleDrivenTask[Config], GrownTask[Config]):
 
         `action` has J rows of W columns for each world, [B, J, W] or [B, J W].
         """
-        action = action.reshape(len(x), -1, BrushLayout.for_config(self.config).width)
+        action = action.reshape(len(x), -1, self.config.brush_layout.width)
         x, s, *_ = self.disturb(self.brush_and_roll(Particles(x, s), action, random), random)
         return x, s
 
