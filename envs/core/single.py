@@ -209,9 +209,11 @@ class NPAEnv(WorldsEnv, gymnasium.Env[Any, Any]):
 
     def _is_cut(self) -> bool:
         """Return whether the episode has come to the limit of its id before `episode_steps`."""
-        entry = gymnasium.registry.get(self.spec.id) if self.spec is not None else None
-        is_long = self.config.episode_steps is not None and entry is not None
-        return is_long and int(self.worlds.episodes.elapsed[0]) == entry.max_episode_steps
+        if self.spec is None or self.config.episode_steps is None:
+            return False
+        entry = gymnasium.registry.get(self.spec.id)
+        elapsed = int(self.worlds.episodes.elapsed[0])
+        return entry is not None and entry.max_episode_steps == elapsed
 
     def _of_world(self, values: dict[str, Tensor]) -> dict[str, Any]:
         return {

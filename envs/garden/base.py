@@ -15,7 +15,6 @@ from npa_envs.envs.core.task import Start
 from npa_envs.envs.garden.brush_actions import (
     OBSERVATION_LIMIT,
     VALUES_PER_PLACE,
-    BrushLayout,
     BrushSpaces,
     GardenConfig,
     apply_brushes,
