@@ -106,6 +106,11 @@ def checked_seeds(name: str, seeds: Iterable[int]) -> list[int]:
 def bound_to(env: Any, policy: Callable[[Any], Any]) -> Callable[[Any], Any]:
     """Return `policy.made_for(env)`, which policies that read worlds have; else `policy` itself."""
     make = getattr(policy, "made_for", None)
+    if make is None and not callable(policy):
+        raise NPAError(
+            f"policy must be a function of observations, got {type(policy).__name__}: of a model "
+            "of Stable-Baselines3 give lambda seen: model.predict(seen, deterministic=True)[0]"
+        )
     return policy if make is None else make(env)
 
 

@@ -135,9 +135,10 @@ def load_policy(source: str, env: Any) -> Callable[[Any], Any]:
     ends: Any = policy.network[0].in_features, policy.network[-1].out_features
     wanted = flatdim(seen), flatdim(acted) if isinstance(acted, Box) else 0
     if ends != wanted or policy.parts != tuple(getattr(seen, "spaces", ())):
+        parts = f" of {', '.join(policy.parts)}" if policy.parts else ""
         raise NPAError(
             f"the policy must fit the environment, {seen} to {acted}, got one from {ends[0]} "
-            f"numbers {policy.parts} to {ends[1]}: make the environment with its own settings"
+            f"numbers{parts} to {ends[1]}: make the environment with its own settings"
         )
     return policy
 

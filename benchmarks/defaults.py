@@ -1,6 +1,7 @@
 """Learners of other libraries by their own defaults, judged by each task's own metric.
 
 python benchmarks/defaults.py npa/Gardener2DSmall-v0 PPO 0 250  # id, learner, seed, CPU seconds
+python benchmarks/defaults.py npa/Gardener2DSmall-v0 SAC 0 250 ent_coef=auto_0.01  # and settings
 
 It prints a line of JSON. Learners are PPO and SAC of Stable-Baselines3, a clone's file
 cleanrl/ppo_continuous_action.py of github.com/vwxyzjn/cleanrl, which runs as it is, and the
@@ -24,6 +25,8 @@ from npa_envs.envs import particles_v0
 
 torch.set_num_threads(1)  # enough for small worlds
 ID, LEARNER, SEED, SECONDS = *sys.argv[1:3], int(sys.argv[3]), float(sys.argv[4])
+SETTINGS = dict(setting.split("=") for setting in sys.argv[5:])
+NAME = " ".join([LEARNER, *sys.argv[5:]])
 AGENTS = ID in particles_v0.SMALL
 METRIC = {"She": "distance", "Poi": "accuracy"}.get(ID[4:7], "loss")
 
@@ -59,7 +62,8 @@ def learned_by_sb3():
         env = supersuit.concat_vec_envs_v1(env, 1, base_class="stable_baselines3")
     is_dict = isinstance(env.observation_space, gym.spaces.Dict)
     network = "MultiInputPolicy" if is_dict else "MlpPolicy"
-    model = getattr(sb3, LEARNER)(network, env, seed=seed, device="cpu")
+    given = {name: value if "auto" in value else float(value) for name, value in SETTINGS.items()}
+    model = getattr(sb3, LEARNER)(network, env, seed=seed, device="cpu", **given)
     end = time.process_time() + SECONDS
     model.learn(10**9, callback=lambda *_: time.process_time() < end)
     return lambda seen: model.predict(seen, deterministic=True)[0], model.num_timesteps
@@ -83,7 +87,7 @@ def learned_by_cleanrl():
     gym.vector.SyncVectorEnv = SameStepVectorEnv
 
     def run(steps):
-        options = {"env-id": ID, "seed": SEED, "total-timesteps": steps}
+        options = {"env-id": ID, "seed": SEED, "total-timesteps": steps, **SETTINGS}
         sys.argv = [LEARNER, "--no-cuda", *(f"--{name}={value}" for name, value in options.items())]
         with contextlib.redirect_stdout(sys.stderr):
             return runpy.run_path(LEARNER, run_name="__main__")
@@ -124,5 +128,5 @@ else:
 # Means of 8 episodes from each of 5 groups of held-out seeds.
 groups = [range(first, first + 8) for first in range(3_000_000, 3_005_000, 1000)]
 means = np.mean([[episode(test, policy, seed) for seed in group] for group in groups], axis=1)
-run = {"id": ID, "learner": LEARNER, "seed": SEED, "steps": steps}
+run = {"id": ID, "learner": NAME, "seed": SEED, "steps": steps}
 print(json.dumps(run | {"return": means[:, 0].tolist(), METRIC: means[:, 1].tolist()}))

@@ -12,7 +12,8 @@ is the sum of the kernels' times, `idle` the fraction of a step without any kern
 With --plain only: plain loops of `env.step` without resets, of single environments and of batches.
 
 With --small only: environment steps a second of the small ids of several B, whole episodes with
-their resets, and no peers. Gardens are measured by benchmarks/gardens.py.
+their resets, and no peers. On a CPU these are seconds of CPU time, of the fastest of some episodes,
+which other programs disturb least. benchmarks/gardens.py has more about gardens.
 
 Peers, on a CPU: Gymnasium steps B of our single environments one after the other ("sync") or in B
 processes ("async"). Environments of other libraries are measured by benchmarks/agents_beside.py.
@@ -36,7 +37,7 @@ from torch.profiler import ProfilerActivity, profile
 from npa_envs.agents.learning import Problem
 from npa_envs.measure.benchmark_records import markdown_table, write_record
 from npa_envs.measure.speed.timing import synchronize
-from npa_envs.registration import SIZES, SPECIES_SIZES
+from npa_envs.registration import CENTRAL, SIZES, SMALL, SPECIES_SIZES
 
 
 class Case(NamedTuple):
@@ -291,12 +292,14 @@ PLAIN_BATCHES = (Case(64, 4096), Case(1024, 1024), Case(1, 1024), Case(64, 1024)
 # Small worlds
 
 SMALL_STEPS = {
-    row.id: row.max_episode_steps for row in (*SIZES, *SPECIES_SIZES) if "Small" in row.id
+    row.id: row.max_episode_steps
+    for row in (*SMALL, *SIZES, *CENTRAL, *SPECIES_SIZES)
+    if "Small" in row.id
 }
 """Steps of an episode by id."""
 
 SMALL_WORLDS = (1, 8, 64)
-SMALL_SECONDS = 0.3
+SMALL_SECONDS = 1.0
 
 
 def measure_small(
@@ -318,13 +321,15 @@ def measure_small(
     envs.step(actions[0])
     envs.reset(seed=0)
     times: list[float] = []
-    while not times or (not quick and sum(times) < SMALL_SECONDS):
+    cuda = device.type == "cuda"
+    clock = time.perf_counter if cuda else time.process_time
+    while not times or (not quick and (sum(times) < SMALL_SECONDS or len(times) < 3)):
         synchronize(device)
-        start = time.perf_counter()
+        start = clock()
         run()
         synchronize(device)
-        times.append(time.perf_counter() - start)
-    taken = statistics.median(times) / steps
+        times.append(clock() - start)
+    taken = (statistics.median(times) if cuda else min(times)) / steps
     envs.close()
     return {
         "id": env_id,

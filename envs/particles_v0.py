@@ -9,10 +9,10 @@ from typing import Any
 
 from npa_envs.envs.core.config import as_python
 from npa_envs.envs.multi.parallel import CrowdEnv, in_turns, register
-from npa_envs.envs.multi.shipped_tasks import task_type
+from npa_envs.envs.multi.shipped_tasks import SETTINGS, TASKS, task_type
 from npa_envs.envs.multi.vector import MultiSpeciesVectorEnv
 from npa_envs.envs.multispecies_v0 import settings
-from npa_envs.errors import NPAError
+from npa_envs.errors import NPAError, check_known
 from npa_envs.registration import SPECIES, SPECIES_SIZES
 
 ENVIRONMENTS = {name.replace("-v0", "Particles-v0"): task for name, task in SPECIES.items()}
@@ -145,8 +145,9 @@ def batched(
 
 def _settings(task: str, species_count: int | None, config: dict[str, Any]) -> dict[str, Any]:
     """Return keywords as `multispecies_v0.settings`, with few particles."""
-    of_species = (ENVIRONMENTS | SMALL).get(task, task) if isinstance(task, str) else task
-    keywords = settings(of_species, species_count, config)
+    own = ENVIRONMENTS | SMALL
+    check_known("task must be a known word, got", task, (*own, *SETTINGS, *TASKS))
+    keywords = settings(own.get(task, task), species_count, config)
     if not as_python(keywords.get("particle_counts")):
         keywords.setdefault("particle_count", PARTICLE_COUNT)
     fields = {name: value for name, value in keywords.items() if name != "task"}

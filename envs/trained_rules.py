@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, ClassVar, TypeVar, get_args
@@ -24,6 +25,8 @@ from npa_envs.world.particles import Particles, combined
 from npa_envs.world.randomness import StreamId, WorldRandom
 from npa_envs.world.rollout import rollout_particles
 
+logger = logging.getLogger(__name__)
+
 FIRST_RULES = {
     "heart": "heart-first",
     **{name: f"{name}-v0" for name in ("butterfly", "flower", "gecko", "letter-a", "octopus")},
@@ -34,6 +37,8 @@ rules do not replace these, so that environments stay the same."""
 FIRST_TEST_SEED = 1_000_000
 """Seed of the first world of the "test" pool, and the largest size of a pool."""
 
+LONG_GROWTH = 2**21
+"""Particles times steps from which growth is logged: seconds on a CPU."""
 
 STEPPED_TOGETHER = 4096
 """Maximum number of particles that a CPU steps together, if they are of several worlds."""
@@ -115,6 +120,11 @@ class GrownTask(PictureEnvTask[Config]):
     def fresh(self, random: WorldRandom) -> Start:
         """Return new worlds, which `rule` has grown from the training task's initial worlds."""
         x, s, *_ = super().fresh(random)
+        if x.shape[0] * x.shape[1] * self.config.grow_steps >= LONG_GROWTH:
+            logger.warning(
+                "growing %d start worlds of %d particles in %d steps of a rule",
+                *x.shape[:2], self.config.grow_steps,
+            )  # fmt: skip
         grown = grow(self.rule, self.config, Particles(x, s), random, dt=1.0, position_noise=0.0)
         return Start(grown.x, grown.s)
 

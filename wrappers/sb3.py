@@ -351,6 +351,12 @@ class RowPolicy:
         return np.asarray(actions, np.float32).reshape(*observed.shape[:-1], -1)
 
 
+def last_axis(space: Box) -> Box:
+    """Return the box of one row, for a box of rows, [N, P], or of one row, [P]."""
+    low, high = (bound.reshape(-1, bound.shape[-1])[0] for bound in (space.low, space.high))
+    return Box(low, high, dtype=np.float32)
+
+
 class SpeciesVecEnv(RowVecEnv):
     """Particles of several species as the rows of a Stable-Baselines3 `VecEnv`.
 
@@ -375,7 +381,7 @@ class SpeciesVecEnv(RowVecEnv):
         if not isinstance(env, MultiSpeciesVectorEnv):
             raise NPAError(
                 f"env must be a batch of worlds of several species, got {type(env).__name__}: "
-                "make one with npa_envs.envs.multispecies_v0.batched"
+                "make one with npa_envs.envs.multispecies_v0.batched or particles_v0.batched"
             )
         check_autoreset(env.autoreset_mode, "same-step")
         self.others = dict(others or {})
@@ -392,11 +398,8 @@ class SpeciesVecEnv(RowVecEnv):
         if not self.rows_of:
             raise NPAError("others must not name all species: at least one has to be rows")
         spaces = env.single_observation_spaces
-        shapes = [spaces[name].shape for name in self.rows_of]
-        self._counts = np.array([math.prod(shape[:-1]) for shape in shapes])
-        self._of_particles = len(shapes[0]) == 1
-        one_row = (lambda space: space) if self._of_particles else row_space
-        observed = one_row(spaces[self.rows_of[0]])
+        self._counts = np.array([math.prod(spaces[name].shape[:-1]) for name in self.rows_of])
+        observed = last_axis(spaces[self.rows_of[0]])
         self._tags = None
         if not self.others:
             species = env.worlds.agent_species[: len(self.rows_of)]
@@ -405,7 +408,7 @@ class SpeciesVecEnv(RowVecEnv):
             self._tags = torch.from_numpy(tags).to(env.worlds.device)
             tag = np.ones(tags.shape[1], np.float32)
             observed = Box(np.append(observed.low, 0.0 * tag), np.append(observed.high, tag))
-        acted = one_row(env.single_action_spaces[self.rows_of[0]])
+        acted = last_axis(env.single_action_spaces[self.rows_of[0]])
         super().__init__(env, env.world_count, int(self._counts.sum()), observed, acted)
 
     def step_wait(self) -> RowSteps:
@@ -416,9 +419,11 @@ class SpeciesVecEnv(RowVecEnv):
         if self._observations is None:
             raise NPAError("step needs worlds: call reset first")
         row_actions = np.split(self.taken_actions(), np.cumsum(self._counts)[:-1], axis=1)
-        if self._of_particles:
-            row_actions = [rows[:, 0] for rows in row_actions]
-        actions: dict[str, Any] = dict(zip(self.rows_of, row_actions, strict=True))
+        spaces = self.vector_env.single_action_spaces
+        actions: dict[str, Any] = {
+            name: rows.reshape(-1, *spaces[name].shape)
+            for name, rows in zip(self.rows_of, row_actions, strict=True)
+        }
         for name, policy in self.others.items():
             actions[name] = policy(self._observations[name])
         observed, rewards, terminations, truncations, infos = self.vector_env.step(actions)
@@ -464,8 +469,9 @@ class SpeciesVecEnv(RowVecEnv):
 
     def _rows(self, by_species: Mapping[str, Any]) -> Tensor:
         """Return the rows' observations [B, R, P]; tags are appended if all species are rows."""
-        parts = [as_tensor(by_species[name]) for name in self.rows_of]
-        rows = torch.stack(parts, dim=1) if self._of_particles else torch.cat(parts, dim=1)
+        parts = (as_tensor(by_species[name]) for name in self.rows_of)
+        # Observations of particles have no dimension of rows.
+        rows = torch.cat([part.view(len(part), -1, part.shape[-1]) for part in parts], dim=1)
         if self._tags is None:
             return rows
         return torch.cat((rows, self._tags.to(rows.device).expand(len(rows), -1, -1)), dim=2)

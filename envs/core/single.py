@@ -133,7 +133,7 @@ class NPAEnv(WorldsEnv, gymnasium.Env[Any, Any]):
         self.action_space = self.spaces.action_space
         self._world_index = torch.zeros(1, dtype=torch.int64, device=self.task.device)
         self._key_generator: np.random.Generator | None = None
-        self._lacks_reward = False
+        self._continues = False
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -146,14 +146,15 @@ class NPAEnv(WorldsEnv, gymnasium.Env[Any, Any]):
         seed = as_python(seed)
         check_options(options, ())
         super().reset(seed=seed)
-        if self._lacks_reward:
+        is_sparse = self.task.rewards_last_step_only
+        if self._continues and (is_sparse or self._is_cut()):
+            what = "its sparse reward, which comes in step" if is_sparse else "step"
             warnings.warn(
-                "an episode ended before its sparse reward, which comes in step episode_steps="
-                f"{self.config.episode_steps}: give that number to gymnasium.make as "
-                "max_episode_steps as well",
+                f"an episode ended before {what} episode_steps={self.config.episode_steps}: give "
+                "that number to gymnasium.make as max_episode_steps as well",
                 stacklevel=2,
             )
-        self._lacks_reward = False
+        self._continues = False
         # A new generator, by `seed` or because the caller set `np_random`, begins a new sequence.
         keys = None
         if seed is not None or self.np_random is not self._key_generator:
@@ -186,7 +187,7 @@ class NPAEnv(WorldsEnv, gymnasium.Env[Any, Any]):
         if terminated or truncated:
             info["reason"] = reason(ending)
         info |= self._of_world(worlds.extra_info() | worlds.step_info())
-        self._lacks_reward = self.task.rewards_last_step_only and not (terminated or truncated)
+        self._continues = not (terminated or truncated)
         self._show()
         returned = self.spaces.observation_output(worlds.host_observation(observation)[0])
         return returned, numbers[0], terminated, truncated, info
@@ -205,6 +206,14 @@ class NPAEnv(WorldsEnv, gymnasium.Env[Any, Any]):
         placed = self.worlds.checked_particles(x, s, 1, self.config.particle_count)
         observation = self._change_worlds(self.worlds.place, self._world_index, placed)
         return self.spaces.observation_output(observation[0])
+
+    def _is_cut(self) -> bool:
+        """Return whether the episode has come to the limit of its id before `episode_steps`."""
+        if self.spec is None or self.config.episode_steps is None:
+            return False
+        entry = gymnasium.registry.get(self.spec.id)
+        elapsed = int(self.worlds.episodes.elapsed[0])
+        return entry is not None and entry.max_episode_steps == elapsed
 
     def _of_world(self, values: dict[str, Tensor]) -> dict[str, Any]:
         return {

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from functools import cached_property
 from typing import Any
 
+import gymnasium
 import numpy as np
 import torch
 from gymnasium import Space
@@ -81,6 +82,11 @@ class NPAVectorEnv(WorldsEnv, BatchedSpaces):
         self.metadata = {**type(self).metadata, "autoreset_mode": self.autoreset_mode}
         self.num_envs = num_envs
         self._make_worlds(keywords, num_envs, steps)
+        if steps is not None and self.config.episode_steps not in (None, steps):
+            gymnasium.logger.warn(
+                f"episode_steps={self.config.episode_steps} and max_episode_steps={steps} differ: "
+                "the smaller one ends episodes"
+            )
         self.single_observation_space = self.spaces.observation_space
         self.single_action_space = self.spaces.action_space
         self.copies = copy

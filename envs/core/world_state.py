@@ -182,11 +182,11 @@ class WorldState:
         return torch.cuda.device(self.device)
 
 
-def not_finite(action: Tensor) -> DivergedError:
+def not_finite(action: Tensor, *, of_particles: bool) -> DivergedError:
     """Return the error for actions, [B, rows, columns], with a number that is not finite."""
-    bad = ~torch.isfinite(action)
-    world, particle, entry = (int(k) for k in bad.nonzero()[0])
+    bad, word = ~torch.isfinite(action), "particle" if of_particles else "row"
+    world, row, entry = (int(k) for k in bad.nonzero()[0])
     return DivergedError(
-        f"action must be finite, got {action[world, particle, entry].item()} at world {world}, "
-        f"particle {particle}, entry {entry} ({int(bad.sum())} such numbers): check the policy"
+        f"action must be finite, got {action[world, row, entry].item()} at world {world}, "
+        f"{word} {row}, entry {entry} ({int(bad.sum())} such numbers): check the policy"
     )

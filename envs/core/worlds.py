@@ -187,7 +187,7 @@ class BatchedWorlds(WorldState):
         if not read[-1]:
             # The step was not made: the next one draws its random numbers again.
             self.random.undo_advance(self.random_steps)
-            raise not_finite(action)
+            raise not_finite(action, of_particles=action.shape[1] == self.particle_count)
         ending_bits = read[:-1].copy()
         if (ending_bits & NOT_FINITE).any():
             self.check_losses(torch.arange(self.world_count, device=self.device))

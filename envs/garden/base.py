@@ -15,7 +15,6 @@ from npa_envs.envs.core.task import Start
 from npa_envs.envs.garden.brush_actions import (
     OBSERVATION_LIMIT,
     VALUES_PER_PLACE,
-    BrushLayout,
     BrushSpaces,
     GardenConfig,
     apply_brushes,
@@ -110,7 +109,7 @@ class GardenTask(RuleDrivenTask[Config], GrownTask[Config]):
 
         `action` has J rows of W columns for each world, [B, J, W] or [B, J W].
         """
-        action = action.reshape(len(x), -1, BrushLayout.for_config(self.config).width)
+        action = action.reshape(len(x), -1, self.config.brush_layout.width)
         x, s, *_ = self.disturb(self.brush_and_roll(Particles(x, s), action, random), random)
         return x, s
 

@@ -75,8 +75,8 @@ class SpeciesConfig(WorldConfig):
     seed_distance: float = 0.4
     """Distance between the centres of neighbouring disks, which lie in a row [length units]."""
 
-    deaths: tuple[tuple[int, int], ...] = ()
-    """Pairs (species, step): the species is removed at the end of that step."""
+    deaths: tuple[tuple[int | str, int], ...] = ()
+    """Pairs (species, step): the species, 1 or "species_1", is removed at the end of that step."""
 
     reward: SpeciesReward = "individual"
     """"individual": each agent is rewarded for its own improvement; "team": each gets the mean."""
@@ -117,6 +117,12 @@ class SpeciesConfig(WorldConfig):
         return tuple(even + int(k < remainder) for k in range(self.species_count))
 
     @property
+    def death_steps(self) -> dict[Any, int]:
+        """Steps of `deaths` by the species' index."""
+        indices: dict[Any, int] = {f"species_{k}": k for k in range(self.species_count)}
+        return {indices.get(k, k): step for k, step in self.deaths}
+
+    @property
     def agent_particle_counts(self) -> tuple[int, ...]:
         """Particles of each species that agents control; the environment acts for the others."""
         return self.counts
@@ -150,11 +156,15 @@ class SpeciesConfig(WorldConfig):
     def _check_deaths(self) -> None:
         deaths, last = self.deaths, self.species_count - 1
         pairs = isinstance(deaths, tuple) and all(
-            isinstance(pair, tuple) and len(pair) == 2 and all(map(is_whole, pair))
+            isinstance(pair, tuple)
+            and len(pair) == 2
+            and (is_whole(pair[0]) or isinstance(pair[0], str))
+            and is_whole(pair[1])
             for pair in deaths
         )
-        fits = pairs and all(0 <= k <= last and step > 0 for k, step in deaths)
-        fits = fits and len({k for k, _ in deaths}) == len(deaths)
+        steps = self.death_steps if pairs else {}
+        fits = pairs and len(steps) == len(deaths)
+        fits = fits and all(k in range(last + 1) and step > 0 for k, step in steps.items())
         rule = (
             f"be pairs (species, step), each species from 0 to {last} at most once, each step at "
             "least 1"

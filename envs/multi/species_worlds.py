@@ -180,7 +180,7 @@ class SpeciesWorlds(WorldState):
         self.agent_returns = AgentReturns(self.task, agent_species, world_count, team=team)
         """The agents' losses and rewards."""
         self._owner = to_device_async(self.owner, device)
-        deaths = dict(config.deaths)
+        deaths = config.death_steps
         self._death_step = np.array([deaths.get(int(k), 0) for k in self.agent_species])
         self._side_stream = SideStream(device) if device.type == "cuda" else None
         self._host_diverged = torch.zeros(

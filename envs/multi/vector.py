@@ -84,6 +84,10 @@ class MultiSpeciesVectorEnv(AgentsEnv):
         self.agents = self.possible_agents
         """All agents, as every species always has arrays."""
 
+    def __repr__(self) -> str:
+        sizes = f"{self.world_count} worlds of {len(self.agents)} agents"
+        return f"<{type(self).__name__} {self._task_name}: {sizes}, max_cycles={self.max_cycles}>"
+
     @cached_property
     def observation_spaces(self) -> dict[str, Space[Any]]:
         """Spaces of all worlds' observations, [B, N_k, P]; large, so made at the first use."""

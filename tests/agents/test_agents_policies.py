@@ -283,6 +283,7 @@ def test_the_error_about_foreign_environments_says_how_to_make_ours():
     hint = str(caught.value).split("make it with ")[1]
     assert interface_of(eval(hint, {"gymnasium": gymnasium})) == Interface(2, 16, True, 1.0)
     elsewhere = gymnasium.vector.AsyncVectorEnv([single])
-    refused("must contain environments of npa_envs", evaluate_policy, elsewhere, None, [0])
+    refused("must contain environments of npa_envs", evaluate_policy, elsewhere, abs, [0])
     elsewhere.close()
+    refused("policy must be a function .* got int: of a model", evaluate_policy, make(), 3, [0])
     refused(r"got CartPoleEnv.*gymnasium\.make\('npa", interface_of, single().unwrapped)

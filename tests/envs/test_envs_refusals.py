@@ -118,6 +118,8 @@ OF_ONE = {
         ({"deaths": ((1, 0),)}, r"deaths must be pairs .* got \(\(1, 0\),\)"),
         ({"deaths": ((1, 5), (1, 6))}, "deaths must be pairs"),
         ({"deaths": (1, 5)}, "deaths must be pairs"),
+        ({"deaths": (("species_2", 5),)}, r"deaths must be pairs .* got \(\('species_2', 5\),\)"),
+        ({"deaths": ((1, 5), ("species_1", 6))}, "at most once"),
         ({"task": "invasion", "reward": "team"}, "reward must be 'individual' in invasion"),
         ({"task": "co_morphogenesis", "targets": ("heart",)}, "targets must be 2 names"),
         ({"task": "symbiosis", "target": "hart"}, "did you mean 'heart'"),
@@ -133,6 +135,7 @@ OF_ONE = {
         ({"world_count": 10**7, "particle_count": 10**4}, "particle_count is too large"),
     ],
     particles_v0.parallel_env: [
+        ({"task": "npa/MixingParticleSmall-v0"}, "did you mean 'npa/MixingParticlesSmall-v0'"),
         ({"particle_count": 513}, "particle_count must be at most 512 .* got 513"),
         ({"particle_counts": (500, 20)}, "particle_count must be at most 512 .* got 520"),
     ],

@@ -87,7 +87,7 @@ def test_actions_that_are_not_finite_change_neither_worlds_nor_their_random_numb
     first, second = sampled(envs[0], 2)
     bad = np.where(np.arange(first.size).reshape(first.shape) == 5, np.inf, first)
     for action in (first, second):
-        refused("action must be finite, got inf at world 0", envs[0].step, bad)
+        refused("action must be finite, got inf at world 0, row", envs[0].step, bad)
         assert_same(envs[0].step(action), envs[1].step(action))
 
 
@@ -295,6 +295,32 @@ def test_only_rewards_that_come_in_the_last_step_can_be_missed(name, warned):
     assert any("before its sparse reward" in str(one.message) for one in caught) == warned
     # Away from its goal a creature is paid -1 in each step.
     assert reward == (0.0 if warned else -1.0)
+
+
+def test_two_lengths_of_episodes_are_warned_of():
+    with pytest.warns(UserWarning, match="episode_steps=2 and max_episode_steps=3 differ"):
+        make_vec(GARDENER, 2, episode_steps=2, max_episode_steps=3)
+    env = begun(make(GARDENER, episode_steps=33))
+    while not env.step(env.action_space.sample())[3]:
+        pass
+    with pytest.warns(UserWarning, match="ended before step episode_steps=33: give that number"):
+        env.reset()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        env.step(env.action_space.sample())
+        env.reset()
+        make_vec(GARDENER, 2, episode_steps=3, max_episode_steps=3)
+
+
+def test_growing_start_worlds_for_seconds_is_logged(monkeypatch, caplog):
+    begun(make(GARDENER))
+    assert not caplog.records
+    monkeypatch.setattr(trained_rules, "LONG_GROWTH", 1)
+    config = begun(make(GARDENER)).unwrapped.config
+    sizes = f"{config.particle_count} particles in {config.grow_steps} steps"
+    assert [record.message for record in caplog.records] == [
+        f"growing 1 start worlds of {sizes} of a rule"
+    ]
 
 
 def test_hindsight_experience_replay_runs_as_it_is():

@@ -64,7 +64,7 @@ def test_species_have_spaces_of_their_own_sizes_and_the_state_shows_all():
 
 def test_a_species_that_is_removed_is_gone():
     each = {"perception": "per_species"}
-    env = begun(make(species_count=3, deaths=((1, 2),), update_prob=1.0, **each))
+    env = begun(make(species_count=3, deaths=(("species_1", 2),), update_prob=1.0, **each))
     _, _, terminations, _, _ = env.step(still(env))
     assert not any(terminations.values())
     observations, rewards, terminations, truncations, infos = env.step(still(env))

@@ -192,6 +192,8 @@ def test_ids_of_particles_are_the_worlds_of_the_ids_of_species():
     tasks = ("npa/InvasionParticlesSmall-v0", "npa/InvasionSmall-v0")
     env, same = (particles_v0.parallel_env(task, max_cycles=2) for task in tasks)
     assert repr(env) == "<ParticlesEnv npa_particles_v0: 64 agents, max_cycles=2>"
+    batch = particles_v0.batched(tasks[0], world_count=2)
+    assert repr(batch) == "<ParticlesVectorEnv invasion: 2 worlds of 64 agents, max_cycles=32>"
     env.reset(seed=3)
     same.reset(seed=3)
     assert np.array_equal(env.state(), same.state())

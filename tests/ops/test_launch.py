@@ -13,6 +13,7 @@ from support.worlds import assert_same, random_world
 import npa_envs
 from npa_envs.ops import launch, position_check
 from npa_envs.ops.perceive import _perceive
+from npa_envs.ops.pictures.splat import _picture_losses, picture_losses
 from npa_envs.ops.random_numbers import draw
 
 WORLDS = 12
@@ -91,6 +92,25 @@ def test_repeated_launches_have_the_results_of_the_first(
     # With and without gradients, backward and fields, of two sizes; threads have their own.
     # On CUDA float64 is sorted with the help of torch's sums, so only backward passes are repeated.
     assert len(repeats) >= (2 if dtype == torch.float64 and device.type == "cuda" else 8)
+
+
+@pytest.mark.usefixtures("nothing_repeated")
+def test_losses_of_pictures_are_repeated_with_the_same_results(device):
+    target, kept = torch.rand(8, 8, 4, device=device), []
+    options = {"goal": target[0, 0, :2].clone(), "shift": 0.5, "pixel_size": 0.2}
+    for call in range(6):
+        x, s = random_world(3, 31, 2, 5, dtype=torch.float32, device=device, seed=call)
+        found = picture_losses(x, s, target, **options)
+        (calls,) = calls_of(_picture_losses._function)
+        assert isinstance(calls, int) == (call < 2)
+        with_others = x.flip(0).contiguous(), s.flip(0).contiguous()
+        # One of other sizes does not repeat, but is launched.
+        alone = picture_losses(with_others[0][:1], with_others[1][:1], target, **options)
+        kept.append((torch.stack(found)[:, -1], torch.stack(alone)[:, 0]))
+        launch._thread.calls.popitem()
+    for found, alone in kept:
+        assert torch.equal(found, alone)
+    assert len({float(found[0]) for found, _ in kept}) == 6
 
 
 @pytest.mark.usefixtures("nothing_repeated")

@@ -469,14 +469,16 @@ def scattering_kernel(scalar: type, module: wp.Module) -> wp.Kernel:
         means: wp.array[vector],
         goal: wp.array[vector],
         scratch: wp.array2d[scalar],
-        # added to
-        picture: wp.array3d[types.colour],
         # outputs
+        picture: wp.array3d[types.colour],
         footprints: wp.array[types.footprint],
         original_index: wp.array[wp.int32],
     ):
         """Draw a world's picture, particle after particle; for devices with few threads."""
         world = range_start + wp.tid()
+        for row in range(view.resolution):
+            for column in range(view.resolution):
+                picture[world, row, column] = types.colour()
         for i in range(world * particle_count, (world + 1) * particle_count):
             position = splat.position_in_world(view, positions[i], means, goal, world)
             footprint = splat.footprint_of(view, position, i, states, shift)

@@ -40,7 +40,7 @@ from npa_envs.ops.backend import KernelRequest, multiprocessor_count
 from npa_envs.ops.custom_op import check_derivatives, custom_op, once_differentiable
 from npa_envs.ops.launch import SCALARS, aligned, launch
 from npa_envs.ops.sort import MAX_INDEX, block_capacity, slice_count
-from npa_envs.ops.world_mean import average_sums, world_mean
+from npa_envs.ops.world_mean import average, average_sums
 
 MAX_SPOT = 1e6
 """Largest standard deviation of a Gaussian [pixels], and largest inverse of one."""
@@ -69,7 +69,7 @@ class Splats(NamedTuple):
 
     def means_and_goal(self) -> tuple[Tensor | None, Tensor | None]:
         """Kernel arguments: each world's mean position, [B, 2], and the goal; or None, None."""
-        return None if self.goal is None else world_mean(self.x), self.goal
+        return None if self.goal is None else average(self.x), self.goal
 
 
 def splat_lanes(device: torch.device) -> int:
@@ -126,7 +126,7 @@ def sort_splats(splats: Splats, view: Any) -> tuple[Tensor, Tensor, Tensor]:
 def scatter_splats(splats: Splats, view: Any) -> tuple[Tensor, Tensor, Tensor]:
     """Return pictures [B, R, R, 4], and footprints and particles as `sort_splats`, on a CPU."""
     x, total = splats.x, splats.total
-    picture = x.new_zeros(x.shape[0], view.resolution, view.resolution, CHANNELS)
+    picture = x.new_empty(x.shape[0], view.resolution, view.resolution, CHANNELS)
     footprints = x.new_empty(total, FOOTPRINT)
     original_index = torch.empty(total, dtype=torch.int32, device=x.device)
     scratch = x.new_empty(x.shape[0], min(2 * view.radius + 1, view.resolution))
@@ -356,7 +356,7 @@ BLOCKS_OF_PROCESSOR = 4
 """Blocks per multiprocessor that gather errors in parallel."""
 
 
-@custom_op("npa::picture_losses")
+@custom_op("npa::picture_losses", of_all=True)
 def _picture_losses(
     x: Tensor,
     states: Tensor,
