@@ -87,8 +87,8 @@ def run_captured(
     forms, weights = tuple(form for form, _ in found), [w for _, each in found for w in each]
     grad_flags = _grad_flags(particles, weights)
     per_world_streams = isinstance(generator, WorldRandom)
-    # That of `torch.backends.cuda.matmul`, whose older getter raises errors.
-    precision = torch._C._get_fp32_precision_getter("cuda", "matmul")
+    # Torch's older getter raises an error if the precision was set in the new way.
+    precision = torch.backends.cuda.matmul.fp32_precision
     shape = (x.shape, particles.s.shape[2], x.dtype, x.device)
     key = spec[1:], forms, shape, grad_flags, per_world_streams, precision
     with capture_lock:
