@@ -173,7 +173,7 @@ export class TrainingCard {
       textContent: label, href: addressOf(`training/${id}/${file}`), download: `${stem}${end}`,
     });
     const how = state === "done" ? `Learned in ${duration(seconds)}` : `Stopped at iteration ${iteration} of ${total}`;
-    const finished = preset === "best" ? " Cut it, wipe a part of it." : " Cuts close; wiped parts may stay grey.";
+    const finished = preset === "best" ? " Cut it, wipe a part of it." : " Cut it, wipe a part of it: it heals in part.";
     const watched = this.showing === id, hint = state === "done" && watched ? finished : "";
     return [
       this.heading(watched ? name : `Your ${name}`), ...this.target(), text(`${how}.${hint}`), watched ? this.quality() : "",
