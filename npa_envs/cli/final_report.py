@@ -73,8 +73,8 @@ WORDS: Mapping[str, str] = {
     "extent": "longest side of the world [length units]; it grows where particles escape",
     "damage": "what is done to grown worlds: states set to zero in a disk, or a slit",
     "wounds": "places that are damaged, one in each copy of a world",
-    "changed": "wounds that leave a mark: they raise the loss near them by a quarter of it, and by a "
-    "tenth of the whole picture's",
+    "changed": "wounds that leave a mark: they raise the loss near them by a quarter of it, and by "
+    "a tenth of the whole picture's",
     "healed": "changed wounds whose mark is gone at the end",
     "scars": "parts of the body where wounds did not heal",
     "before": "loss before the damage; of wounds, near them",

@@ -555,4 +555,4 @@ MORPHOGENESIS2D_PRESETS = presets_of(
     ),
 )  # fmt: skip
 """2D morphogenesis: `paper` (arXiv 2601.16096), `best` (any picture, one run of minutes on a GPU),
-`detail` (`best` with thin lines, at twice the cost of a step), `fast` (minutes on one core), `tiny` (tests)."""
+`detail` (thin lines as well), `fast` (minutes on one core), `tiny` (tests)."""

@@ -38,7 +38,7 @@ class TaskEntry:
     summary: str
     """One line for lists."""
     presets: Mapping[str, TrainConfig[Any]]
-    """Configurations by name: `paper`, `fast`, `tiny`; `best`, `detail` where a recipe was searched."""
+    """Configurations by name: `paper`, `fast`, `tiny`; where searched for, `best`, `detail`."""
     make: Callable[[Any, torch.device], Task]
     """Returns the task of a configuration, on a device."""
     targets: Callable[[], tuple[str, ...]]

@@ -74,7 +74,7 @@ def test_environments_of_ones_own_are_viewed(tmp_path, monkeypatch):
         (["no_module:Worm-v0"], "unknown environment 'no_module:Worm-v0'"),
         (["CartPole-v1"], "env must be an environment of npa_envs, got 'CartPole-v1'"),
         (["npa/Texture-v0", "--policy", "duck"], "the environment's space_dim, 2, got 3"),
-        (["npa/Texture-v0", "--policy", "gecko"], "got 0.1: make the environment with the keyword eps0=0.1"),
+        (["npa/Texture-v0", "--policy", "gecko"], "make the environment with the keyword eps0=0.1"),
         (["npa/Texture-v0", "--policy", "digits"], "got one of static particles"),
         (["nowhere.safetensors"], "'nowhere.safetensors': it does not exist"),
         (["gecko", "--policy", "random"], "policy is for environments"),
