@@ -57,8 +57,8 @@ def presets() -> Iterator[str]:
     from npa_envs.training import TASKS
 
     yield "PRESETS of tasks: npa-envs train TASK --preset PRESET"
-    yield "  iterations × worlds, and about how long they take on one CPU core; `best`, `detail`,"
-    yield "  `paper` are for a GPU, where `best` and `detail` take minutes"
+    yield "  iterations × worlds, and about how long on one CPU core; `best`, `detail` and `paper`"
+    yield "  are for a GPU, where the first two take minutes"
     for name, entry in TASKS.items():
         yield f"  {name}: {entry.summary}"
         for preset, config in entry.presets.items():
