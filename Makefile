@@ -23,11 +23,14 @@ DEV := $(VENV)/installed-dev
 DOCS := $(VENV)/installed-docs
 INPUTS := pyproject.toml constraints.txt
 
-PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2
+# Each worker takes whole folders, whose libraries and kernels the other one need not load.
+PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist worksteal
 CUDA_WORKERS ?= 8
 
 .PHONY: demo test test-all test-cuda check docs bench-check golden-check faults clean
 .DELETE_ON_ERROR:
+# Tests start processes, each of which would compile the library's modules again.
+unexport PYTHONDONTWRITEBYTECODE
 
 $(BIN)/python:
 	$(PYTHON) -c 'import sys; v = sys.version_info; v >= (3, 11) or sys.exit("npa-envs needs Python 3.11 or newer, got %d.%d: make PYTHON=python3.12" % v[:2])'

@@ -110,8 +110,9 @@ def load_policy(source: str, env: Any) -> Callable[[Any], Any]:
     special = {"scripted": isinstance(task, GardenTask), "shipped": id in shipped}
     known = ["zero", "random", *(name for name, is_there in special.items() if is_there)]
     is_word = isinstance(source, str) and source == Path(source).stem and not Path(source).exists()
-    rules = shipped_rules() | preset_rules() if by_particle else ()
-    if is_word and source not in (*known, *rules):
+    other = is_word and source not in known
+    rules = shipped_rules() | preset_rules() if other and by_particle else ()
+    if other and source not in rules:
         hint = "take another" if source in special else suggest(source, [*known, *rules])
         raise NPAError(
             "source must be zero, random, scripted or shipped, of which the environment "

@@ -398,7 +398,7 @@ def check_rule_fits(rule: NPARule, wanted: Interface, config: Any) -> None:
         if math.isclose(actual, value, rel_tol=1e-6) if is_float else actual == value:
             continue
         wanted_text, text = (f"{n:g}" if is_float else repr(n) for n in (value, actual))
-        hint = f"make the environment with {name}={text}"
+        hint = f"make the environment with the keyword {name}={text}"
         if name == "space_dim":
             hint = "choose another environment or another rule"
         raise NPAError(

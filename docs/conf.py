@@ -76,8 +76,9 @@ html_theme = "furo"
 # Browsers draw MathML themselves: the site needs no script for formulas, and no network.
 html_math_renderer = "mathml"
 html_title = "npa-envs"
-html_static_path = ["static/site.css"]
+html_static_path = ["static/site.css", "static/site.js"]
 html_css_files = ["site.css"]
+html_js_files = ["site.js"]
 html_extra_path = ["static/index.html"]
 html_show_sphinx = False
 html_favicon = "static/icon.svg"
@@ -128,7 +129,11 @@ def add_summaries(app: Sphinx, name: str, *_: Any) -> None:
         for page, text in SUMMARY.findall((ROOT / f"{listing}.md").read_text(encoding="utf-8")):
             plain = re.sub(r"[`]|\[([^\]]+)\]\([^)]+\)", r"\1", text).strip(" .")
             said[os.path.normpath(Path(listing).parent / page)] = plain
-    app.add_js_file(None, body=f"const SUMMARIES = {json.dumps(said)};")
+    glossary = (ROOT / "docs/glossary.md").read_text(encoding="utf-8").lower()
+    rows = re.findall(r"^\| ([^|\\]+) \|", glossary, re.MULTILINE)
+    words = [re.sub("[`_]", " ", word).strip() for row in rows for word in row.split(", ")]
+    body = f"const SUMMARIES = {json.dumps(said)}, WORDS = {json.dumps(words)};"
+    app.add_js_file(None, body=body)
 
 
 SET_ASIDE: dict[str, list[str]] = {}

@@ -53,14 +53,15 @@ def home_path(path: str | Path) -> Path:
 def open_regular(path: str | Path, *, limit: int, what: str = "the file") -> IO[bytes]:
     """Open a file for reading bytes; raise NPAError unless it is a regular one of <= `limit` bytes.
 
-    `what` names the file in errors.
+    `what` and the path name the file in errors, but "it" alone where the caller's errors have both.
     """
     path = checked_path(path)
+    named = what if what == "it" else f"{what} {shown(str(path))}"
     try:
         # Without this flag, opening a pipe without a writer would block.
         descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0))
     except OSError as error:
-        raise NPAError(_unreadable(f"{what} {shown(str(path))}", error)) from error
+        raise NPAError(_unreadable(named, error)) from error
     status = os.fstat(descriptor)
     rule = ""
     if not stat.S_ISREG(status.st_mode):
@@ -70,7 +71,7 @@ def open_regular(path: str | Path, *, limit: int, what: str = "the file") -> IO[
         rule = f"must have at most {limit / _MIB:.0f} MiB, got {status.st_size / _MIB:.0f} MiB"
     if rule:
         os.close(descriptor)
-        raise NPAError(f"{what} {shown(str(path))} {rule}")
+        raise NPAError(f"{named} {rule}")
     return os.fdopen(descriptor, "rb")
 
 

@@ -65,18 +65,16 @@ def checked_once(check: Callable[Arguments, Result]) -> Callable[Arguments, Resu
     def checked(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Result:
         if torch.compiler.is_compiling():
             return check(*args, **kwargs)
-        forms: list[Any] = [*kwargs]
-        values: tuple[Any, ...] = (*args, *kwargs.values())
-        for value in values:
-            kind = type(value)
-            if kind in IMMUTABLE:
-                # With the type: True is 1, and 1 is 1.0.
-                forms += (kind, value)
-            elif kind is Tensor or kind is nn.Parameter:
-                forms += (value.is_nested or value.shape, value.dtype, value.device, value.layout)
-            else:
-                return check(*args, **kwargs)
-        key = tuple(forms)
+        forms: list[Any] = [*args, *kwargs.values()]
+        # With the types: True is 1, and 1 is 1.0.
+        kinds = tuple(map(type, forms))
+        tensors = _tensor_places(kinds)
+        if tensors is None:
+            return check(*args, **kwargs)
+        for k in tensors:
+            value = forms[k]
+            forms[k] = value.is_nested or value.shape, value.dtype, value.device, value.layout
+        key = kinds, tuple(kwargs), tuple(forms)
         # `results` where there is no result, as that may be None.
         result: Any = results.get(key, results)
         if result is results:
@@ -87,6 +85,13 @@ def checked_once(check: Callable[Arguments, Result]) -> Callable[Arguments, Resu
         return cast("Result", result)
 
     return checked
+
+
+@functools.lru_cache(MAX_CHECKED)
+def _tensor_places(kinds: tuple[type, ...]) -> list[int] | None:
+    """Return which of these types are tensors; None: a type is neither that nor immutable."""
+    places = [k for k, kind in enumerate(kinds) if kind in (Tensor, nn.Parameter)]
+    return places if IMMUTABLE.issuperset({*kinds} - {Tensor, nn.Parameter}) else None
 
 
 def check_dense(name: str, tensor: Tensor) -> None:
@@ -194,7 +199,7 @@ def check_device(name: str | torch.device) -> torch.device:
     if index >= count:
         raise NPAError(
             f"device must be one that torch sees, got {shown(str(name))}, but it sees {count} CUDA "
-            "devices: use device='cpu', or see `npa-envs doctor`"
+            "devices: use 'cpu', or see `npa-envs doctor`"
         )
     return torch.device("cuda", index)
 
@@ -459,8 +464,7 @@ def check_fraction(config: object, *names: str) -> None:
 
 def check_word(config: object, name: str, choices: Sequence[str | None]) -> None:
     """Check that a field is one of `choices`, which may include None."""
-    value, known = getattr(config, name), [choice for choice in choices if choice is not None]
-    check_field(config, name, value in choices, "be a known word", suggest(value, known))
+    checked_choice(name, getattr(config, name), choices)
 
 
 def check_flag(config: object, *names: str) -> None:

@@ -1,10 +1,10 @@
 """Options and fixtures of the whole suite."""
 
+import gc
 import os
 from pathlib import Path
 
 import pytest
-import torch
 
 REFERENCE = Path(
     os.environ.get(
@@ -19,6 +19,11 @@ def pytest_addoption(parser):
 
 def pytest_collection_modifyitems(items):
     """Skip tests that need CUDA where there is none, and mark those that `--device` changes."""
+    # The process that only hands out tests does without its slow import.
+    import torch
+
+    # What is imported stays, and need not be looked at in each collection.
+    gc.freeze()
     skip = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
     for item in items:
         if item.get_closest_marker("gpu"):
@@ -29,6 +34,8 @@ def pytest_collection_modifyitems(items):
 
 @pytest.fixture(scope="session")
 def device(request):
+    import torch
+
     chosen = torch.device(request.config.getoption("--device"))
     if chosen.type == "cuda" and not torch.cuda.is_available():
         pytest.fail("--device cuda was asked for, and this machine has no CUDA device")
@@ -43,9 +50,11 @@ def reference():
     return REFERENCE
 
 
-@pytest.fixture(params=[torch.float32, torch.float64], ids=["float32", "float64"])
+@pytest.fixture(params=["float32", "float64"])
 def dtype(request):
-    return request.param
+    import torch
+
+    return getattr(torch, request.param)
 
 
 @pytest.fixture(params=[2, 3], ids=["2d", "3d"])

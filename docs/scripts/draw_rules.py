@@ -1,8 +1,9 @@
 """Draw what the shipped rules grow, `docs/images/rules_*.webp`, each beside its target.
 
-    python docs/scripts/draw_rules.py [--only {2d,3d,textures} ...]
+    python docs/scripts/draw_rules.py [--only {2d,3d,textures,presets} ...]
 
-It takes some minutes on a CPU, textures half an hour. Draw anew when a rule changes.
+It takes some minutes on a CPU, textures half an hour. Draw anew when a rule changes. `presets`
+needs runs: `npa-envs train morphogenesis2d --target NAME --out runs/fast/NAME`, for three names.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ import npa_envs
 from npa_envs.render import to_uint8, write_filmstrip
 from npa_envs.rule.files import shipped_rules
 from npa_envs.tasks.targets.views import composited
-from npa_envs.training.task_of_rule import task_of_rule
+from npa_envs.training.task_of_rule import task_for_film, task_of_rule
 
 IMAGES = Path(__file__).resolve().parents[1] / "images"
 SEED = 1_000_000
@@ -70,6 +71,21 @@ def pictures() -> Shots:
 
 
 @torch.no_grad()
+def presets() -> Shots:
+    """Return each target, and step 512 of its rules by the presets `fast` and `best`."""
+    shots: Shots = []
+    for name in ("gecko", "butterfly", "octopus"):
+        row: Shots = []
+        for preset, source in (("fast", f"runs/fast/{name}"), ("best", name)):
+            task, ((x, s),) = grown(source, (512,))
+            rule = npa_envs.load_rule(source)
+            task = task_for_film(task, source, rule, CPU, least=0, resolution=176)
+            row.append((preset, to_uint8(task.picture(x, s)[0])))
+        shots += [(name, to_uint8(task.target_picture)), *row]
+    return shots
+
+
+@torch.no_grad()
 def things() -> Shots:
     """Return held-out views of each target above what its rule has grown at step 128."""
     shots: Shots = []
@@ -95,7 +111,7 @@ def textures() -> Shots:
     return shots
 
 
-DRAWN = {"2d": pictures, "3d": things, "textures": textures}
+DRAWN = {"2d": pictures, "3d": things, "textures": textures, "presets": presets}
 
 
 def main() -> None:
@@ -104,7 +120,8 @@ def main() -> None:
     parser.add_argument("--only", nargs="+", choices=DRAWN, default=DRAWN, help="default: all")
     for name in parser.parse_args().only:
         captions, frames = zip(*DRAWN[name](), strict=True)
-        write_filmstrip(IMAGES / f"rules_{name}.webp", frames, captions, columns=5)
+        columns = 3 if name == "presets" else 5
+        write_filmstrip(IMAGES / f"rules_{name}.webp", frames, captions, columns=columns)
 
 
 if __name__ == "__main__":

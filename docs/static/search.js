@@ -1,5 +1,5 @@
 // How the search orders what it finds. Sphinx copies this to the page of the search, which has SUMMARIES: what the lists
-// of pages say of each page, in their order.
+// of pages say of each page, in their order; and the WORDS that the glossary explains.
 const PAGES = Object.keys(SUMMARIES);
 const wordsOf = (text) => splitQuery(text.toLowerCase().replaceAll("_", " "));
 const SEARCHED = wordsOf(new URLSearchParams(location.search).get("q") || "");
@@ -20,7 +20,7 @@ var Scorer = {
 
   score(result) {
     const [page, title, anchor, about, score] = result;
-    if (about) return score;
+    if (about) return score - 12 * /^Python (attribute|property|method)/.test(about);
     const summary = SUMMARIES[page] || "";
     const card = page.includes("/shipped/");
     if (card) result[1] = `Card: ${title}`;
@@ -31,7 +31,8 @@ var Scorer = {
       score +
       (anchor ? 10 : 20) * hasAll(named) +
       15 * (!anchor && named.includes(` ${SEARCHED.join(" ")}`)) +
-      15 * hasAll(` ${wordsOf(summary).join(" ")}`) -
+      15 * hasAll(` ${wordsOf(summary).join(" ")}`) +
+      12 * (page === "docs/glossary" && WORDS.includes(SEARCHED.join(" "))) -
       12 * (card || /^docs.environments.(?!README)/.test(page)) -
       (place < 0 ? 12 : place / 5)
     );

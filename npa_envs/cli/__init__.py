@@ -7,7 +7,6 @@ import errno
 import importlib
 import io
 import os
-import re
 import sys
 from collections.abc import Iterator, Sequence
 
@@ -78,10 +77,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         with _printed_targets():
             return _dispatch(words)
     except NPAError as error:
-        message = re.sub(r"make the environment with (?=\w+=)", "say --keywords ", str(error))
-        message = re.sub(r"\binitial_rule=(?=['\"])", "--initial-rule ", message)
-        message = message.replace("use device='cpu'", "leave out --device")
-        print(f"npa-envs: error: {' '.join(message.split())}", file=sys.stderr)
+        print(f"npa-envs: error: {' '.join(str(error).split())}", file=sys.stderr)
         return ERROR
     except KeyboardInterrupt:
         print("npa-envs: interrupted", file=sys.stderr)

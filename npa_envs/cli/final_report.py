@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
 import shlex
@@ -43,6 +44,7 @@ from npa_envs.render.picture_files import write_filmstrip, write_gif
 from npa_envs.render.world_film import SCREEN, film_states, film_world, write_3d_world
 from npa_envs.rule.files import load_rule
 from npa_envs.tasks.damage import DamageEvent
+from npa_envs.training import RunFolder, TrainConfig, check_device, config_to_dict, task_entry
 from npa_envs.training.task_of_rule import task_for_film, task_of_rule, tasks_of_codes
 
 if TYPE_CHECKING:
@@ -56,7 +58,7 @@ FILM_STEPS = 512
 TITLES: Mapping[str, str] = {
     "healing": "After damage:",
     "pictures": "Each picture by its own code, and by that of the next one, shuffled:",
-    "judge": "Distances that no loss uses; 1 is that of a quarter of the target from all of it:",
+    "judge": "Distances that no loss uses; 1: between a quarter of the target and the whole:",
     "changes": "Some steps after a change of the clouds:",
 }
 """Lines above tables of a model card."""
@@ -73,7 +75,7 @@ WORDS: Mapping[str, str] = {
     "wounds": "places that are damaged, one in each copy of a world",
     "changed": "wounds that leave a mark: the loss near them rises by more than a quarter, and by "
     "more than a tenth of the whole picture's loss",
-    "healed": "of these, wounds whose mark is gone",
+    "healed": "changed wounds whose mark is gone at the end",
     "scars": "parts of the body where wounds did not heal",
     "before": "loss before the damage; of wounds, near them",
     "after": "that right after the damage",
@@ -98,18 +100,19 @@ LIKENESS = 20.0
 
 
 def write_report(
-    path: Path, folder: Path, task_name: str, training: str, device: torch.device, *, progress: bool
+    path: Path, task_name: str, config: TrainConfig[Any], training: str, *, progress: bool
 ) -> tuple[Path, str]:
     """Measure and film the rule in the file `path`; return the model card's path and its scores.
 
-    The scores are a line of text, then one for each of `shortfalls`. `training` tells how the rule
-    was trained: iterations, time and command.
+    The scores are a line of text, then one for each of `shortfalls`, then those of `next_steps`.
+    `training` says how the rule was trained: iterations, time and command.
 
-    The folder gets the model card STEM.md, STEM.json as of `npa-envs evaluate --json`, STEM.gif,
-    STEM.mp4, STEM-filmstrip.png, for a 3D rule also a turntable and point files, for a classifier
-    STEM-states.gif and STEM-states.png. On a CPU fewer worlds are measured, for fewer steps, and
-    only pictures and objects are damaged.
+    The run's folder `report` gets the model card STEM.md, STEM.json as of `npa-envs evaluate
+    --json`, STEM.gif, STEM.mp4, STEM-filmstrip.png, for a 3D rule also a turntable and point files,
+    for a classifier STEM-states.gif and STEM-states.png. On a CPU fewer worlds are measured, for
+    fewer steps, and only pictures and objects are damaged.
     """
+    folder, device = RunFolder(config.out).report, check_device(config.device)
     common.writable_folder(folder)
     rule = load_rule(path, device=device).float()
     task = task_of_rule(str(path), rule, device).task
@@ -141,17 +144,21 @@ def write_report(
     text = tables_json(tables, **facts)
     write_text(folder / f"{path.stem}.json", text)
     model_card = folder / f"{path.stem}.md"
-    names = {"The target, and a world.": "target", "A world from the seed on.": "filmstrip"}
-    names["Hidden states of particles, projected to the plane, by class."] = "states"
+    names = {
+        "The target, and a world.": "target",
+        "A world from the seed on.": "filmstrip",
+        "Hidden states of particles, projected to the plane, by class.": "states",
+    }
     pictures = "\n\n".join(
         f"![{text}]({path.stem}-{name}.png)"
         for text, name in names.items()
         if (folder / f"{path.stem}-{name}.png").exists()
     )
-    more = further_training(path, task_name, tables)
-    card = _model_card(rule, task, task_name, training, facts, tables, pictures, more)
+    usual, more = next_steps(path, task_name, config, tables)
+    clauses = shortfalls(tables) + usual
+    card = _model_card(rule, task, task_name, training, facts, tables, pictures, clauses, more)
     write_text(model_card, card)
-    clauses = shortfalls(tables) + [f"train on: {more}"] * bool(more)
+    clauses += [f"train on: {more}"] * bool(more)
     said = "".join(f"\n              {clause}" for clause in clauses)
     return model_card, score_line(json.loads(text)) + missing_films + said
 
@@ -220,12 +227,49 @@ def shortfalls(tables: Mapping[str, Sequence[Any]]) -> list[str]:
     return clauses
 
 
-def further_training(path: Path, task: str, tables: Mapping[str, Sequence[Any]]) -> str:
-    """Return the command that trains on a run's rule whose worlds fail unhurt; else ""."""
-    if path.name != "rule.safetensors" or not shortfalls({"growth": tables.get("growth", ())}):
-        return ""
-    run = shlex.quote(str(path.parent))
-    return f"npa-envs train {task} --config {run}/config.json --initial-rule {run} --out {run}2"
+def nearest_preset(task_name: str, config: TrainConfig[Any]) -> str:
+    """Return the preset from which a configuration differs in the fewest fields."""
+
+    def fields_of(config: TrainConfig[Any]) -> dict[str, Any]:
+        values = config_to_dict(config)
+        return {**values.pop("task"), **values}
+
+    presets, values = task_entry(task_name).presets, fields_of(config)
+    shared = {
+        name: sum(values[key] == value for key, value in fields_of(one).items())
+        for name, one in presets.items()
+    }
+    return max(shared, key=shared.__getitem__)
+
+
+def next_steps(
+    path: Path, task_name: str, config: TrainConfig[Any], tables: Mapping[str, Sequence[Any]]
+) -> tuple[list[str], str]:
+    """Return what is usual of a run's rule with these tables, and a command that trains on, or "".
+
+    Runs are trained on that are shorter than their preset, or whose worlds fail unhurt.
+    """
+    presets, usual, words = task_entry(task_name).presets, list[str](), list[str]()
+    name = nearest_preset(task_name, config)
+    total = presets[name].total_iterations
+    if config.total_iterations < total:
+        usual = [f"{config.total_iterations} iterations of the {total} of the preset `{name}`"]
+        words = ["--iterations", str(-(-total // config.repeats))]
+    elif (
+        name == "fast"
+        and presets.get("best", config).wound_chance > config.wound_chance
+        and shortfalls({"healing": tables.get("healing", ())})
+    ):
+        usual = ["usual for `fast`; `best`, which `--device cuda` takes, heals most wounds"]
+    run = str(path.parent)
+    failing = words or shortfalls({"growth": tables.get("growth", ())})
+    if path.name != "rule.safetensors" or not failing:
+        return usual, ""
+    stem = run.rstrip("0123456789")
+    outs = (f"{stem}{k}" for k in itertools.count(int(run.removeprefix(stem) or 1) + 1))
+    words = ["--config", f"{run}/config.json", "--initial-rule", run, *words]
+    words += ["--out", next(out for out in outs if not Path(out).exists())]
+    return usual, shlex.join(["npa-envs", "train", task_name, *words])
 
 
 def _model_card(
@@ -236,6 +280,7 @@ def _model_card(
     facts: Mapping[str, str],
     tables: Mapping[str, Sequence[Any]],
     pictures: str,
+    clauses: Sequence[str],
     more: str,
 ) -> str:
     config = task.config
@@ -258,7 +303,7 @@ def _model_card(
         ("machine", f"{facts['machine']}, torch {used['torch']}, warp-lang {used['warp-lang']}"),
         ("date", facts["date"]),
     ]
-    failures = [f"- {clause[0].upper()}{clause[1:]}." for clause in shortfalls(tables)]
+    failures = [f"- {clause[0].upper()}{clause[1:]}." for clause in clauses]
     parts = [
         f"# {Path(goal).stem}",
         f"A rule of the task `{task_name}` for `{goal}`{others}.",

@@ -57,14 +57,14 @@ def presets() -> Iterator[str]:
     from npa_envs.training import TASKS
 
     yield "PRESETS of tasks: npa-envs train TASK --preset PRESET"
-    yield "  iterations × worlds, and about how long they take on one CPU core; `best` and `paper`"
-    yield "  are for a GPU, where `best` takes minutes"
+    yield "  iterations × worlds, and about how long they take on one CPU core; `best`, `detail` and"
+    yield "  `paper` are for a GPU, where `best` and `detail` take minutes"
     for name, entry in TASKS.items():
         yield f"  {name}: {entry.summary}"
         for preset, config in entry.presets.items():
             seconds = entry.expected_seconds(config) or 0.0
             work = f"{config.total_iterations:>6} × {config.world_count}"
-            yield f"    {preset:<6}{work:<12} {common.duration(seconds)}"
+            yield f"    {preset:<7}{work:<12} {common.duration(seconds)}"
 
 
 def targets() -> Iterator[str]:

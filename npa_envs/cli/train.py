@@ -28,7 +28,6 @@ from npa_envs.training import (
     JointTrainConfig,
     RunFolder,
     TrainConfig,
-    check_device,
     config_to_dict,
     load_config,
     preset,
@@ -60,9 +59,10 @@ class TrainOptions(common.SharedRunOptions):
     """How a run starts and ends."""
 
     preset: str = ""
-    """Configuration to start from: `paper`, `fast` (minutes on a CPU), `tiny` (seconds), or for
-    pictures and textures `best` (minutes on a GPU); `npa-envs list` prints sizes and times. By
-    default `best` on CUDA if the task has it, else `fast`."""
+    """Configuration to start from: `paper`, `fast` (minutes on a CPU), `tiny` (seconds), for
+    pictures and textures `best` (minutes on a GPU), or for pictures with thin lines `detail`;
+    `npa-envs list` prints sizes and times. By default `best` on CUDA if the task has it, else
+    `fast`."""
     config: Path | None = None
     """YAML, TOML or JSON file of fields and values, also `preset`; overrides the preset."""
     max_seconds: float = math.inf
@@ -320,7 +320,8 @@ def run(
 
     def begun() -> None:
         if processes.first:
-            print("\n".join(announcement(task_name, options, config, processes.count)))
+            lines = announcement(task_name, options, config, arguments, processes.count)
+            print("\n".join(lines))
             end = f"(Ctrl-C writes a checkpoint and stops; {resume_command} continues)"
             print(f"writing to {config.out}/ {end}", flush=True)
 
@@ -367,11 +368,10 @@ def finish(
         seconds = result.record.get("seconds", 0.0)
         command = shlex.join(["npa-envs", "train", *arguments])
         training = f"{result.iteration} iterations in {seconds:.0f} s.\n\n```sh\n{command}\n```"
-        device = check_device(config.device)
         for rule in rules:
             try:
                 card, scores = write_report(
-                    rule, folder.report, task_name, training, device, progress=options.progress
+                    rule, task_name, config, training, progress=options.progress
                 )
                 print(f"  report      {card}: {scores}")
             except NPAError as error:
@@ -419,7 +419,11 @@ def _species(config: TrainConfig[Any]) -> Sequence[Any]:
 
 
 def announcement(
-    task_name: str, options: TrainOptions, config: TrainConfig[Any], process_count: int = 1
+    task_name: str,
+    options: TrainOptions,
+    config: TrainConfig[Any],
+    arguments: Sequence[str] = (),
+    process_count: int = 1,
 ) -> tuple[str, str]:
     """Return two printed lines: a run's targets, and its size and expected time."""
     species = _species(config)
@@ -441,8 +445,12 @@ def announcement(
     if options.report:
         time += "; then the report"
     where = config.device if process_count == 1 else f"{process_count} processes ({config.device})"
+    source = "continues" if options.resume else source
+    given = options.config or options.resume or not hasattr(species[0], "target")
+    given = given or any(word.startswith("--target") for word in arguments)
+    default = "" if given else f"no --target{'s' * (len(species) > 1)} given: "
     return (
-        f"{task_name}: learns {' and '.join(goals)} ({'continues' if options.resume else source})",
+        f"{task_name}: {default}learns {' and '.join(goals)} ({source})",
         f"{config.total_iterations} iterations, each of {config.world_count} worlds of "
         f"{particles} particles, on {where}: {time}",
     )

@@ -1,7 +1,7 @@
 """The metric of textures: a picture's distance from the target, by no loss that training uses.
 
 It has three parts: shapes in patches after local contrast normalisation, local contrasts, and
-colours, each at three lengths. Each is divided by that of a quarter of the target from all of it.
+colours, each at three lengths. Each is divided by that between a quarter of the target and all.
 """
 
 from __future__ import annotations

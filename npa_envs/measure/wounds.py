@@ -93,10 +93,8 @@ class WoundRow:
         if self.changed:
             marks = f"{self.changed} of {self.wounds} wounds left a mark"
             return f"{self.damage}: {marks}, and {self.healed} of these healed"
-        return (
-            f"{self.damage}: too small to measure: none of {self.wounds} wounds raised the loss "
-            "near it above the bound, which rises with the rule's own loss"
-        )
+        what = f"none of {self.wounds} wounds stands out from the picture's own faults"
+        return f"{self.damage}: too small to measure: {what}"
 
 
 def wound_rows(

@@ -219,10 +219,6 @@ class _PreparedLaunch:
                 number = declared(*value) if isinstance(value, tuple) else value
                 setattr(self.memory, self.names[k], number)
 
-    def set_address(self, index: int, tensor: Tensor) -> None:
-        """Point an array argument at another tensor of the same shape and dtype."""
-        getattr(self.memory, self.names[index]).data = tensor.data_ptr() or _empty_address(tensor)
-
     def run(self, size: tuple[int, ...]) -> None:
         """Launch the kernel with `size` threads along each dimension."""
         raise NotImplementedError
@@ -425,20 +421,19 @@ class RecordedLaunches:
                     offset = type(descriptor).data.offset
                     yield ctypes.c_uint64.from_buffer(descriptor, offset), value
 
-    def argument_slots(self, tensor: Tensor) -> list[tuple[_PreparedLaunch, int]]:
-        """Return launches and indices whose argument is `tensor`, which the caller keeps alive."""
-        slots, address = [], tensor.data_ptr()
-        for (prepared, _), arguments in zip(self.launches, self._tensors, strict=True):
-            for k, value in enumerate(arguments):
-                if isinstance(value, Tensor) and value.data_ptr() == address:
-                    arguments[k] = None
-                    slots.append((prepared, k))
-        return slots
+    def argument_slots(self, tensor: Tensor) -> list[Any]:
+        """Return the addresses of `tensor` in arguments; the caller keeps it alive."""
+        begin = tensor.data_ptr()
+        found = [(slot, value) for slot, value in self.addresses() if value.data_ptr() == begin]
+        gone = {id(value) for _, value in found}
+        self._tensors = [[None if id(v) in gone else v for v in each] for each in self._tensors]
+        return [slot for slot, _ in found]
 
-    def move(self, slots: list[tuple[_PreparedLaunch, int]], tensor: Tensor) -> None:
+    def move(self, slots: list[Any], tensor: Tensor) -> None:
         """Put a tensor of the same shape and dtype at these `slots`; the caller keeps it alive."""
-        for prepared, index in slots:
-            prepared.set_address(index, tensor)
+        address = tensor.data_ptr() or _empty_address(tensor)
+        for slot in slots:
+            slot.value = address
 
     def replay(
         self, begin: int = 0, end: int | None = None, *, last_count: int | None = None
@@ -546,7 +541,7 @@ class _Repeat:
         self._several = None if isinstance(results, Tensor) else type(results)
         made: list[Tensor] = [results] if self._several is None else [*results]
         self._makes = [
-            functools.partial(torch.empty, each.shape, dtype=each.dtype, device=each.device)
+            functools.partial(torch.empty, (*each.shape,), dtype=each.dtype, device=each.device)
             for each in made
         ]
         self._launches, self._block_bytes = recorded.launches, 0

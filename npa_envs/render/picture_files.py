@@ -228,12 +228,12 @@ def _shared_palette(pictures: list[Frame]) -> tuple[Image.Image, Frame, int]:
     """Return 256 colours for all frames, the most frequent colour, and its index among them."""
     step = max(1, math.ceil(sum(p.size // 3 for p in pictures) / 2**20))
     sample = np.concatenate([p.reshape(-1, 3)[k % step :: step] for k, p in enumerate(pictures)])
-    _, which, counts = np.unique(
-        (sample >> 3) @ np.array([1024, 32, 1]), return_inverse=True, return_counts=True
-    )
-    means = [np.bincount(which, weights=sample[:, k]) / counts for k in range(3)]
-    shades, shade_counts = np.unique(sample[which == counts.argmax()], axis=0, return_counts=True)
-    background = shades[shade_counts.argmax()]
+    coarse = (sample >> 3) @ np.array([1024, 32, 1])
+    counts = np.bincount(coarse)
+    means = [np.bincount(coarse, sample[:, k]) / np.maximum(counts, 1) for k in range(3)]
+    shades = sample[coarse == counts.argmax()]
+    fine = (shades & 7) @ np.array([64, 8, 1])
+    background = shades[(fine == np.bincount(fine).argmax()).argmax()]
     # Weighted by roots of counts: otherwise a large background takes most of the palette.
     repeats = np.ceil(np.sqrt(counts)).astype(np.int64)
     swatch = np.repeat(np.stack(means, axis=1).round().astype(np.uint8), repeats, axis=0)[None]

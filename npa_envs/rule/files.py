@@ -100,7 +100,7 @@ def load_rule(source: str | Path, *, device: str | torch.device = "cpu") -> NPAR
             fields = {name: _hyper_parameter(header, name, cls) for name, cls in _FIELDS.items()}
             parts = RuleParts(fields, weights)
         else:
-            content = read_bytes(path, limit=_MAX_FILE)
+            content = read_bytes(path, limit=_MAX_FILE, what="it")
             is_demo = path.suffix == ".json"
             parts = read_demo_json(content, name) if is_demo else read_state_dict(content)
         rule = _rule_of(parts)
@@ -263,7 +263,7 @@ def _locate(source: str | Path) -> tuple[Path, str | None]:
         cure = f"npa-envs train morphogenesis2d --target {shown(text)} trains a rule of it"
         raise NPAError(
             f"a rule's file must end in {suffixes}, got {shown(text)}: "
-            f"{cure if is_picture else 'rename it'}"
+            f"{cure if is_picture else 'give the file of a rule, or the folder of a run'}"
         )
     if os.path.dirname(text):
         raise NPAError(f"cannot load a rule from {shown(text)}: it does not exist: check the path")
@@ -293,7 +293,7 @@ def read_tensors(
 
     Without `with_weights` there are none.
     """
-    open_regular(path, limit=_MAX_FILE).close()
+    open_regular(path, limit=_MAX_FILE, what="it").close()
     try:
         with safe_open(path, framework="pt") as file:
             header: dict[str, str] = file.metadata() or {}

@@ -364,22 +364,24 @@ class NPARule(nn.Module):
     def has_network(self) -> bool:
         """Return whether no subclass, hook or layer alters what `NPARule` computes."""
         cls, attributes = type(self), self.__dict__
-        # Plain loops, as each rollout comes here; torch.compile traces no set operation.
-        for name in STEP_PARTS:
-            if name in attributes:
+        # Each rollout comes here; torch.compile traces no set operation.
+        if cls is NPARule and not torch.compiler.is_compiling():
+            if not STEP_PARTS.isdisjoint(attributes):
                 return False
-            if cls is not NPARule and getattr(cls, name) is not getattr(NPARule, name):
-                return False
+        else:
+            for name in STEP_PARTS:
+                if name in attributes or getattr(cls, name) is not getattr(NPARule, name):
+                    return False
         # `_modules` is faster than attributes of modules.
-        layers = self._modules
+        layers: Any = self._modules
         for name in ("hidden", "output", "fate") if self.divides else ("hidden", "output"):
             layer = layers.get(name)
-            if type(layer) is not nn.Linear or is_altered(layer) or _has_backward_hooks(layer):
+            if type(layer) is not nn.Linear or is_altered(layer, backward=True):
                 return False
         return (
-            getattr(layers["hidden"], "bias", None) is not None
-            and getattr(layers["output"], "bias", None) is None
-            and not (is_altered(self) or _has_backward_hooks(self))
+            layers["hidden"]._parameters.get("bias") is not None
+            and layers["output"]._parameters.get("bias") is None
+            and not is_altered(self, backward=True)
             and not _has_any_global_hook()  # type: ignore[no-untyped-call]
         )
 
@@ -498,18 +500,17 @@ HYPER_PARAMETERS = {k: v for k, v in get_type_hints(NPARule.__init__).items() if
 """Arguments of `NPARule`: name -> type."""
 
 
-def is_altered(module: nn.Module) -> bool:
-    """Return whether a module has forward hooks, or a `forward` other than its class's."""
-    return bool("forward" in vars(module) or module._forward_hooks or module._forward_pre_hooks)
-
-
-def _has_backward_hooks(module: nn.Module) -> bool:
-    return bool(module._backward_hooks or module._backward_pre_hooks)
+def is_altered(module: nn.Module, *, backward: bool = False) -> bool:
+    """Return whether a module has its own `forward`, or hooks; with `backward`, also those."""
+    own = module.__dict__
+    if backward and (own["_backward_hooks"] or own["_backward_pre_hooks"]):
+        return True
+    return bool("forward" in own or own["_forward_hooks"] or own["_forward_pre_hooks"])
 
 
 @torch.no_grad()
-def with_codes(rule: NPARule, untrained: NPARule) -> NPARule:
-    """Copy the weights of a rule without codes into an untrained rule with codes, and return that.
+def enlarged(rule: NPARule, untrained: NPARule) -> NPARule:
+    """Copy the weights of a rule without codes into an untrained, larger one, and return that.
 
     The columns of the code and additional hidden units keep their untrained weights. Where the
     shapes do not fit, nothing is copied and `rule` is returned.

@@ -193,5 +193,7 @@ def _joint_preset(name: str) -> JointTrainConfig[CoMorphogenesis2DConfig]:
     return JointTrainConfig(**{**run, "out": Path("runs/co_morphogenesis2d")})
 
 
-CO_MORPHOGENESIS2D_PRESETS = {name: _joint_preset(name) for name in MORPHOGENESIS2D_PRESETS}
+CO_MORPHOGENESIS2D_PRESETS = {
+    name: _joint_preset(name) for name in ("paper", "best", "fast", "tiny")
+}
 """Each preset of 2D morphogenesis, with as many particles of a second species, by AdamW."""

@@ -519,19 +519,22 @@ SPECIES_RUN: Mapping[str, Any] = {
 """Settings of a run of several species: AdamW, an initial world in every batch, which are half of
 batches of two worlds, and no stillness loss (docs/species.md)."""
 
-MORPHOGENESIS2D_PRESETS = presets_of(
-    "morphogenesis2d", paper=TrainConfig(task=Morphogenesis2DConfig()),
-    # Found by experiment on pictures that nobody tuned for: docs/recipes.md.
-    best=TrainConfig(
-        task=Morphogenesis2DConfig(
-            escape_share=2e-4, damage_radius=0.2, cut_share=0.8, cut_anywhere=True, **_STABILITY,
-        ),
-        repeats=1, iterations=15_000, pool_size=64, steps=(48, 80), optimiser="muon",
-        learning_rate=3e-3, weight_decay=0.1, schedule="cosine", max_age_range=(16, 16_384),
-        damage_and_keep_share=0.7, damage_share=0.125, stillness_min_age=1024, stillness_weight=2.0,
-        stillness_power=4.0, dead_zone=1e-3, initial_rule="heart-first", wound_chance=0.2,
-        wound_weight=0.5,
+# Found by experiment on pictures that nobody tuned for: docs/recipes.md.
+_BEST: TrainConfig[Morphogenesis2DConfig] = TrainConfig(
+    task=Morphogenesis2DConfig(
+        escape_share=2e-4, damage_radius=0.2, cut_share=0.8, cut_anywhere=True, **_STABILITY,
     ),
+    repeats=1, iterations=15_000, pool_size=64, steps=(48, 80), optimiser="muon",
+    learning_rate=3e-3, weight_decay=0.1, schedule="cosine", max_age_range=(16, 16_384),
+    damage_and_keep_share=0.7, damage_share=0.125, stillness_min_age=1024, stillness_weight=2.0,
+    stillness_power=4.0, dead_zone=1e-3, initial_rule="heart-first", wound_chance=0.2,
+    wound_weight=0.5,
+)  # fmt: skip
+
+MORPHOGENESIS2D_PRESETS = presets_of(
+    "morphogenesis2d", paper=TrainConfig(task=Morphogenesis2DConfig()), best=_BEST,
+    # A wider network and a radius that holds 1.7 times the neighbours: thin lines.
+    detail=replace(_BEST, task=replace(_BEST.task, hidden_dim=512, eps=0.13), iterations=12_000),
     # A few particles that see far; of two worlds one is young, one grown and at rest:
     # docs/recipes.md.
     fast=fast_run(
@@ -552,4 +555,4 @@ MORPHOGENESIS2D_PRESETS = presets_of(
     ),
 )  # fmt: skip
 """2D morphogenesis: `paper` (arXiv 2601.16096), `best` (any picture, one run of minutes on a GPU),
-`fast` (minutes on one core), `tiny` (tests)."""
+`detail` (`best` with thin lines, at twice the cost of a step), `fast` (minutes on one core), `tiny` (tests)."""

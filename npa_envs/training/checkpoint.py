@@ -110,7 +110,7 @@ def check_same_run(
     ]
     if differences:
         written = (path.parent / "rule.safetensors").is_file()
-        start = f", from this rule with initial_rule={str(path.parent)!r}" if written else ""
+        start = f", with the initial rule {str(path.parent)!r}" if written else ""
         raise NPAError(
             f"the checkpoint {str(path)!r} is of another configuration ({'; '.join(differences)}): "
             f"resume with the configuration in {str(path.with_name('config.json'))!r}, or start a "

@@ -38,7 +38,7 @@ class TaskEntry:
     summary: str
     """One line for lists."""
     presets: Mapping[str, TrainConfig[Any]]
-    """Configurations by name: `paper`, `fast`, `tiny`, and `best` where a recipe was searched."""
+    """Configurations by name: `paper`, `fast`, `tiny`; `best`, `detail` where a recipe was searched."""
     make: Callable[[Any, torch.device], Task]
     """Returns the task of a configuration, on a device."""
     targets: Callable[[], tuple[str, ...]]
@@ -141,7 +141,7 @@ def preset(name: str, task_name: str = "morphogenesis2d", /, **fields: Any) -> T
     """Return a preset with fields replaced by name.
 
     Args:
-        name: `paper`, `fast`, `tiny`, or `best` where the task has it.
+        name: `paper`, `fast`, `tiny`, or `best` and `detail` where the task has them.
         task_name: The task it is for.
         fields: New values by field name, of the run or of the task.
 
@@ -216,7 +216,7 @@ def load_config(
     """
     path = checked_path(path)
     try:
-        text = read_bytes(path, limit=MAX_FILE).decode("utf-8")
+        text = read_bytes(path, limit=MAX_FILE, what="it").decode("utf-8")
     except (NPAError, UnicodeDecodeError) as error:
         raise NPAError(f"cannot read the configuration file {shown(str(path))}: {error}") from error
     parse = PARSERS.get(path.suffix.lower())

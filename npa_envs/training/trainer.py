@@ -20,7 +20,7 @@ from npa_envs.atomic_files import write_text
 from npa_envs.checks import check_device, is_real
 from npa_envs.errors import DivergedError, NPAError, shown
 from npa_envs.rule.files import load_rule, preset_rules, rule_like, save_rule
-from npa_envs.rule.rule import NPARule, with_codes, with_division
+from npa_envs.rule.rule import NPARule, enlarged, with_division
 from npa_envs.tasks.base import Task
 from npa_envs.tasks.train_config import TrainConfig
 from npa_envs.training.checkpoint import (
@@ -432,17 +432,18 @@ def take_options(rule: NPARule, config: TrainConfig[Any]) -> None:
 def initial_rule(config: TrainConfig[Any], untrained: NPARule) -> NPARule:
     """Return the rule that a run starts from, with the shapes of the task's untrained one.
 
-    A rule without division or codes may initialise one with them. An equivariant rule has no dead
-    zone, and starts from random weights where the configuration names one of `preset_rules`, which
-    are not equivariant.
+    A rule without division or codes may initialise one with them, and one of `preset_rules` a rule
+    with more hidden units, of any ε0. An equivariant rule has no dead zone, and starts from random
+    weights where the configuration names one of `preset_rules`, which are not equivariant.
     """
     take_options(untrained, config)
     source = config.initial_rule
     if not source or (untrained.equivariant and source in preset_rules()):
         return untrained
     rule = load_rule(source)
-    if untrained.code_dim and not rule.code_dim:
-        rule = with_codes(rule, untrained)
+    narrow = source in preset_rules() and untrained.hidden_dim > rule.hidden_dim
+    if narrow or (untrained.code_dim and not rule.code_dim):
+        rule = enlarged(rule, untrained)
     if untrained.divides and not rule.divides:
         rule = with_division(rule)
     rule.dead_zone = untrained.dead_zone
@@ -450,8 +451,8 @@ def initial_rule(config: TrainConfig[Any], untrained: NPARule) -> NPARule:
     if differences:
         raise NPAError(
             f"initial_rule must be a rule of the task's shape, but {shown(source)} differs in "
-            f"{differences}: change those fields, start from another rule, or from random weights "
-            "(initial_rule='')"
+            f"{differences}: change those fields, start from another rule, or from random weights, "
+            "with the initial rule ''"
         )
     return rule
 

@@ -32,6 +32,9 @@ class LiveWorld(ABC):
     _generator: torch.Generator | None = None
     """Random numbers of damage and brushes; None: torch's own."""
 
+    _trained_values: Mapping[str, float] = {}
+    """Settings as the rule was trained, by name."""
+
     def __init__(self, seed: int) -> None:
         self.seed = int(SEEDS.checked("seed", seed))
         self.playing = True
@@ -45,14 +48,17 @@ class LiveWorld(ABC):
 
     def describe(self) -> WorldEvent:
         """Return the event "world"; subclasses add the fields of their worlds."""
+        ranges = self._ranges()
+        values = {name: getattr(self, name) for name in ranges}
+        trained = {**values, **self._trained_values}
         return {
             "type": "world",
             "tools": [{"name": name} | brush._asdict() for name, brush in self.brushes.items()],
             "shows": self._shows(),
             "show": self.show,
             "settings": {
-                name: {"value": getattr(self, name)} | limits._asdict()
-                for name, limits in self._ranges().items()
+                name: {"value": values[name], "trained": trained[name]} | limits._asdict()
+                for name, limits in ranges.items()
             },
             "playing": self.playing,
             "seed": self.seed,

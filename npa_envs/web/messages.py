@@ -70,7 +70,7 @@ class WorldEvent(TypedDict, total=False):
     class_count: int  # Classes of which the particles' own colours name one; 0: these are others.
     tools: list[dict[str, Any]]  # The world's brushes: `name`, and the fields of `Brush`.
     damages: list[str]  # Kinds of damage, as the page's buttons name them.
-    settings: dict[str, dict[str, Any]]  # By name: `value`, and the fields of `Range`.
+    settings: dict[str, dict[str, Any]]  # By name: `value`, `trained`, the fields of `Range`.
     capabilities: list[str]  # Some of "film", "loss".
     playing: bool
     seed: int

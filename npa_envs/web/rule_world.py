@@ -85,7 +85,8 @@ class RuleWorld(LiveWorld):
         # Tasks with their targets, of which the slider of N makes many.
         self._trained = functools.lru_cache(8)(self._load_task)
         others = {name: name for name in shipped_rules()} if choices is None else dict(choices)
-        name = rule_name(source)
+        named = {path: name for name, path in (choices or {}).items()}
+        name = named.get(source) or rule_name(source)
         self._choices = others | {name: source}
         self._choose_rule(name, particle_count)
 
@@ -115,6 +116,8 @@ class RuleWorld(LiveWorld):
         if self.show not in self._shows():
             self.show = "colours"
         self.reset(self.seed)
+        physics = ("eps", "update_prob", "noise", "count")
+        self._trained_values = {name: getattr(self, name) for name in physics}
 
     @torch.no_grad()
     def _begin(self, seed: int | None) -> None:
@@ -423,13 +426,14 @@ class RunWorld(RuleWorld):
         device: torch.device,
         seed: int = 0,
         particle_count: int | None = None,
+        name: str | None = None,
     ) -> None:
         self._run_folder = RunFolder(folder)
         self._points: list[list[float]] = []
         """Iterations and losses of the log."""
         self._log_version: Any = None
         files = rules_of_run(self._run_folder)
-        self._files = {rule_name(str(path)): path for path in files}
+        self._files = {name or rule_name(str(path)): path for path in files}
         self._centres = [0.0]
         if len(files) > 1:
             # Seeds lie in a row, as in training.

@@ -11,6 +11,7 @@ import subprocess
 import sys
 import threading
 import time
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,9 @@ from npa_envs.atomic_files import made_folder, read_json, write_bytes
 from npa_envs.errors import NPAError
 from npa_envs.measure.process_queue import PARENT_GRACE, PARENT_PIPE
 from npa_envs.measure.quality import psnr_on_white
+from npa_envs.rule.files import rule_metadata
 from npa_envs.training.run_folder import JsonlLog, RunFolder
+from npa_envs.training.task_of_rule import trained_config
 from npa_envs.training.task_table import task_entry
 from npa_envs.web.dropped_file import EMOJI, MAX_BYTES, PICTURE, READ_SECONDS, stored_name
 from npa_envs.web.export import page_rule, page_text
@@ -239,23 +242,26 @@ class Training:
 
 # The world of a training.
 
-GROWN = 96
-"""Age from which a world is compared with its picture [steps]."""
+GROWN, OLD = 3, 4
+"""Ages, in longest rollouts of the training, from which a world is compared with its picture, and
+begins again: early rules lead worlds to where later ones never are."""
 
-OLD = 320
-"""Age from which a world begins again when its rule is replaced [steps]: early rules lead worlds
-to where later ones never are."""
+OUTSIDE = 0.03
+"""Fraction of particles outside of the view from which a world begins again."""
 
 
 class LearningWorld(RunWorld):
-    """The world of the latest run of a training, which begins again with later rules."""
+    """The world of the latest run of a training; it begins again and again while that learns."""
 
     def __init__(self, training: Training, *, device: torch.device) -> None:
         self._training = training
         self._title, self._run_id = training.report["name"], training.report["id"]
         self._psnr: float | None = None
         self._end_awaited = True
-        super().__init__(Path(training.report["folder"]), device=device)
+        self._touched = 0
+        super().__init__(Path(training.report["folder"]), device=device, name=self._title)
+        config = trained_config(rule := self._run_folder.rule, rule_metadata(rule))
+        self._rollout_steps, self._longest_life = config.steps[1], config.max_age_range[1]
         self.speed = 2
 
     @property
@@ -265,19 +271,43 @@ class LearningWorld(RunWorld):
 
     def describe(self) -> WorldEvent:
         """Return the event "world" for the page, with the dropped file's name as title."""
-        return super().describe() | {"title": self._title, "note": ""}
+        described = super().describe() | {"title": self._title, "note": ""}
+        # The plot of the training's loss says more than that of a world that begins again.
+        return described | ({"capabilities": ["film"]} if self.learns else {})
 
-    def _take_rules(self) -> None:
-        super()._take_rules()
-        if self.step >= OLD or not self.learns:
+    def handle(self, message: Mapping[str, Any]) -> bool:
+        """Apply a message of the page; what a hand has done is seen for another life."""
+        if message.get("type") in ("brush", "damage"):
+            self._touched = self.step
+        return super().handle(message)
+
+    def _begin(self, seed: int | None) -> None:
+        super()._begin(seed)
+        self._touched = 0
+        # The page's tracers follow particles by their index.
+        self._events.append({"type": "reordered"})
+
+    def _run(self, steps: int) -> None:
+        super()._run(steps)
+        if not self.learns:
+            return
+        report, frame, x = self._training.report, self.task.frame, self.particles.x[0]
+        # The better the rule, the longer it is watched.
+        share = report.get("iteration", 0) / report.get("total", 1)
+        life = max(OLD * self._rollout_steps, share * self._longest_life)
+        strays = ((x - x.new_tensor(frame.centre)).abs() > frame.half_width).any(dim=-1)
+        if self.step - self._touched >= life or float(strays.float().mean()) > OUTSIDE:
             self.reset(self.seed)
 
     def _poll(self) -> None:
+        # Asked first: after the end no rule comes.
+        ended = self._end_awaited and not self.learns
         super()._poll()
-        if self._end_awaited and not self.learns:
+        if ended:
             self._end_awaited = False
             self.reset(self.seed)
-        if self.step < GROWN or not self._is_unchanged():
+            self._events.append(self.describe())
+        if self.step < GROWN * self._rollout_steps or not self._is_unchanged():
             return
         value = round(float(psnr_on_white(self.task, *self.particles[:2]).mean()), 1)
         if value != self._psnr:

@@ -83,14 +83,14 @@ def run_captured(
         observed = not explicit and any(map(is_observed, own))
         if observed or torch.is_autocast_enabled(x.device.type):
             return None
-    forms, rule_weights = zip(*map(settings_and_weights, rules, plain), strict=True)
-    weights = list(itertools.chain.from_iterable(rule_weights))
+    found = [*map(settings_and_weights, rules, plain)]
+    forms, weights = tuple(form for form, _ in found), [w for _, each in found for w in each]
     grad_flags = _grad_flags(particles, weights)
     per_world_streams = isinstance(generator, WorldRandom)
     # Torch's older getter raises an error if the precision was set in the new way.
     precision = torch.backends.cuda.matmul.fp32_precision
     shape = (x.shape, particles.s.shape[2], x.dtype, x.device)
-    key = spec._replace(steps=0), forms, shape, grad_flags, per_world_streams, precision
+    key = spec[1:], forms, shape, grad_flags, per_world_streams, precision
     with capture_lock:
         group = _groups.count(key, MAX_CAPTURED_GROUPS)
     if group.launched_only or group.calls <= (1 if explicit else LAUNCHED_FIRST):

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from npa_envs.errors import NPAError
 from npa_envs.ops.custom_op import once_differentiable
-from npa_envs.ops.position_check import PositionCheck
+from npa_envs.ops.position_check import PositionCheck, is_slow
 from npa_envs.rule.rule import NPARule
 from npa_envs.world.cuda_graph import GraphSequence, capture, current_stream, prepare_capture
 from npa_envs.world.particles import Particles, combined
@@ -111,6 +111,9 @@ class CapturedRollout:
             lambda value: torch.empty(value.shape, dtype=value.dtype, device=value.device)
         )
         self._inputs = [*self._worlds.tensors(), *itertools.chain.from_iterable(weights)]
+        fixed = self._worlds.x.detach()
+        self._check = None if is_slow(fixed) else PositionCheck(fixed, captured=True)
+        """The check of positions that the graphs make; None: each call makes one."""
         self._grad_flags = call.grad_flags or (False,) * len(self._inputs)
         self.differentiable = any(self._grad_flags)
         """Whether backward passes are captured."""
@@ -259,6 +262,8 @@ class CapturedRollout:
             return saved[-1]
 
         generator = self._generator if self._streams is None else self._streams
+        if self._check is not None:
+            self._check.begin()
         hooks = torch.autograd.graph.saved_tensors_hooks(save, lambda tensor: tensor)
         with torch.set_grad_enabled(self.differentiable), hooks:
             step = spec.make_step(self._rules, self._worlds)
@@ -283,7 +288,7 @@ class CapturedRollout:
         """Replay a call's graphs; return copies of the worlds. `use` lives until the last pass."""
         generator = call.generator
         inputs = self._inputs_of(call)
-        check = PositionCheck(call.particles.x)
+        check = self._check or PositionCheck(call.particles.x)
         results: list[Particles] = []
         for steps in call.blocks:
             if self.differentiable:
@@ -298,7 +303,14 @@ class CapturedRollout:
                 worlds = Particles(*self.forward(steps, inputs, generator))
             if not results:
                 # Only now, when the device has work.
-                self._wait_for(check, generator, steps)
+                try:
+                    check.wait()
+                except NPAError:
+                    if self._streams is None:
+                        count = steps * self._draws_per_step
+                        source = torch_generator(generator, self.device)
+                        give_back_draws(source, self._generator.get_offset() - count, count)
+                    raise
             if self._streams is not None:
                 assert isinstance(generator, WorldRandom)
                 generator.sync_with(self._streams, steps)
@@ -317,23 +329,14 @@ class CapturedRollout:
             return results[-1]
         return combined(torch.cat, results)
 
-    def _wait_for(self, check: PositionCheck, generator: Randomness | None, steps: int) -> None:
-        """Raise NPAError, with the generator as before the replay, unless positions are finite."""
-        try:
-            check.wait()
-        except NPAError:
-            if self._streams is None:
-                count = steps * self._draws_per_step
-                source = torch_generator(generator, self.device)
-                give_back_draws(source, self._generator.get_offset() - count, count)
-            raise
-
     def forward(
         self, steps: int, tensors: Sequence[Tensor], generator: Randomness | None
     ) -> list[Tensor]:
         """Replay a rollout, and return copies of the resulting worlds; not differentiable."""
         with self._on_device:
             self._wait_for_last_use()
+            if self._check is not None:
+                self._check.restart()
             torch._foreach_copy_(self._inputs, list(tensors))
             self._load_draws(generator, steps)
             graphs = self.graphs[steps]
@@ -391,10 +394,8 @@ def _views(tensors: Sequence[Tensor]) -> list[Tensor]:
 
 
 def _copies(tensors: list[Tensor]) -> list[Tensor]:
-    """Return copies of tensors, made by one kernel."""
-    copies = [torch.empty_like(tensor) for tensor in tensors]
-    torch._foreach_copy_(copies, tensors)
-    return copies
+    """Return copies of tensors of real numbers, made by one kernel and allocated by torch."""
+    return list(torch._foreach_mul(tensors, 1.0))
 
 
 class _Replayed(torch.autograd.Function):

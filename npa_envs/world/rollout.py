@@ -95,10 +95,9 @@ def step(
     Returns:
         Positions [length units], shape [B, N, D], and states, dimensionless, shape [B, N, C].
     """
-    x, s = rollout(
+    after = rollout_particles(
         rule,
-        x,
-        s,
+        Particles(x, s),
         1,
         eps=eps,
         box=box,
@@ -111,7 +110,7 @@ def step(
         on_divergence=on_divergence,
         cuda_graph=cuda_graph,
     )
-    return x, s
+    return after.x, after.s
 
 
 def at_rest(

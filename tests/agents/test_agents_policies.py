@@ -247,16 +247,22 @@ FORMS = {
 }
 
 
+# Two of four worlds succeed.
+SEEDS, STOPPING = (4, 1, 2, 7), {"particle_count": 32, "max_episode_steps": 40, "success_loss": 0.9}
+
+
+@pytest.fixture(scope="module")
+def expected():
+    env = make_vector(**STOPPING)
+    return evaluate_policy(env, PaintPolicy(env), SEEDS)
+
+
 @pytest.mark.parametrize("form", FORMS)
-def test_episodes_are_the_same_in_every_form_of_an_environment(form):
-    # Two of four worlds succeed.
-    keywords = {"particle_count": 32, "max_episode_steps": 40, "success_loss": 0.9}
-    usual, seeds = make_vector(**keywords), [4, 1, 2, 7]
-    expected = evaluate_policy(usual, PaintPolicy(usual), seeds)
-    env = (make if form.startswith("single") else make_vector)(**keywords, **FORMS[form])
-    policy = PaintPolicy(usual if form == "async" else env)
+def test_episodes_are_the_same_in_every_form_of_an_environment(form, expected):
+    env = (make if form.startswith("single") else make_vector)(**STOPPING, **FORMS[form])
+    policy = PaintPolicy(make_vector(**STOPPING) if form == "async" else env)
     # Seeds may be anything that gives one after the other.
-    found = evaluate_policy(env, policy, iter(seeds))
+    found = evaluate_policy(env, policy, iter(SEEDS))
     env.close()
     assert found.endings == expected.endings
     assert set(found.endings) == {"success", "time limit"}

@@ -103,9 +103,9 @@ TIMED = {"learning_seconds": 1.0}
 
 REFUSED = {
     fitted: [
-        ({"rule": {}, "eps0": 0.2}, "eps0, 0.2, got 0.1: make .* with eps0=0.1"),
-        ({"rule": {}, "alpha": 1.0}, "alpha, 1, got 0.5: make .* with alpha=0.5"),
-        ({"rule": {}, "state_dim": 8}, "make the environment with state_dim=16"),
+        ({"rule": {}, "eps0": 0.2}, "eps0, 0.2, got 0.1: make .* with the keyword eps0=0.1"),
+        ({"rule": {}, "alpha": 1.0}, "alpha, 1, got 0.5: make .* with the keyword alpha=0.5"),
+        ({"rule": {}, "state_dim": 8}, "make the environment with the keyword state_dim=16"),
         ({"rule": {"space_dim": 3}}, "space_dim, 2, got 3"),
         ({"rule": {"static": True}}, "got one of static particles"),
         ({"rule": {"moment_correction": False}}, "moment_correction=True"),
@@ -184,13 +184,13 @@ REFUSED = {
         ({"method": "clone", "teacher": "heart", "student_share": 1.5}, "student_share"),
         ({"method": "clone", "teacher": "heart"}, "state_dim"),
         ({"method": "ppo", "masked": "False"}, "masked must be True or False, got 'False'"),
-        ({"method": "ppo", "ratio": "both"}, "a known word, got 'both': known: particle, wo"),
+        ({"method": "ppo", "ratio": "both"}, "'particle' or 'world', got 'both'"),
         (
             {"method": "ppo", "particle_rewards": "particle", "ratio": "world"},
             "needs ratio='particle'",
         ),
         ({"method": "ppo", "gamma": 0.0}, r"gamma must lie in \(0, 1\], got 0.0"),
-        ({"method": "ppo", "critic": "all"}, "known word, got 'all': known: central, particle"),
+        ({"method": "ppo", "critic": "all"}, "'particle' or 'central', got 'all'"),
         ({"method": "shac", "steps": 0}, "steps must be"),
         ({"method": "ppo", "problem": problem(env_id=SHAPESHIFTER)}, "'ppo' cannot learn codes"),
         ({"method": "gradient", "problem": INVASION}, "gradients .* each other's expense"),

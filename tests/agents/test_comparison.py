@@ -374,13 +374,22 @@ def train_wildly(progress):
     return lambda observation: math.nan + still(observation)
 
 
-@pytest.mark.parametrize("name", ["morphogenesis2d", "mixing"])
-def test_a_policy_whose_actions_are_not_finite_has_diverged(name, tmp_path, monkeypatch):
+@pytest.mark.parametrize(
+    ("task", "method", "status", "error"),
+    [
+        ("morphogenesis2d", "wild", "diverged", "must be finite"),
+        ("mixing", "wild", "diverged", "must be finite"),
+        ("mixing", "gradient", "failed", "NPAError: world_count must be a whole number"),
+    ],
+)
+def test_a_run_records_what_it_raises(task, method, status, error, tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(METHODS, "wild", f"{__name__}:train_wildly")
-    facts = request_of(name, "wild", tmp_path)
+    options = ("gradient.num_envs=0",) if method == "gradient" else ()
+    facts = request_of(task, method, tmp_path, options=options)
     one_run.run(tmp_path, "cpu")
     result = RunRecord.read(tmp_path, facts)
-    assert (result.status, "must be finite" in result.error) == ("diverged", True)
+    assert (result.status, error in result.error) == (status, True)
+    assert "Traceback" in capsys.readouterr().err
 
 
 # Tables
@@ -494,27 +503,28 @@ def test_a_picture_shows_the_end_of_the_episode_and_not_the_next_start(name, dev
 # The whole command
 
 
-def quick_words(methods: str, particle_steps: int, options: str) -> list[str]:
-    """Words of a quick comparison; the options begin with one of evolution."""
+def quick_words(methods: str, out: Path) -> list[str]:
     return (
         f"compare --quick --tasks morphogenesis2d --seed-count 1 --no-progress --methods {methods} "
-        f"--particle-steps {particle_steps} --options evolution.{options}"
+        f"--particle-steps 5000 --out {out}"
     ).split()
 
 
-def test_a_quick_comparison_stops_goes_on_and_refuses_other_settings(tmp_path, capsys):
+def test_a_quick_comparison_stops_goes_on_and_refuses_other_settings(tmp_path, capsys, monkeypatch):
     pytest.importorskip("cma")
-    words = quick_words("zero evolution", 5_000, f"population=4 --commit test --out {tmp_path}")
+    words = quick_words("zero evolution", tmp_path)
+    words += ["--options", "evolution.population=4", "--commit", "test"]
     assert main([*words, "--max-seconds", "1e-3"]) == 0
     assert "1 runs are left: call again" in capsys.readouterr().out
     folder = tmp_path / "particle-steps" / "morphogenesis2d"
     (first,) = folder.rglob("run.json")
     before = first.stat().st_mtime_ns
+    quick = CHILD.format(body="    pass", before="")
+    monkeypatch.setattr(one_run, "PROGRAM", (sys.executable, "-c", quick))
     assert main(words) == 0
     printed = capsys.readouterr().out
     assert "are left" not in printed
     assert first.stat().st_mtime_ns == before
-
     folder /= "evolution/seed-0"
     content = json.loads((folder / "run.json").read_text(encoding="utf-8"))
     assert (content["status"], len(content["returns"])) == ("done", 4)
@@ -524,21 +534,19 @@ def test_a_quick_comparison_stops_goes_on_and_refuses_other_settings(tmp_path, c
     assert len(list(RuleSet.load(folder, make_problem("morphogenesis2d", quick=True)))) == 1
     assert f"| evolution | 1 | {np.mean(content['returns']):.3f}" in printed
     table = json.loads((tmp_path / "comparison.json").read_text(encoding="utf-8"))
-    assert [row["method"] for row in table["rows"]] == ["evolution", "zero"]
+    assert {row["method"] for row in table["rows"]} == {"evolution", "zero"}
     assert (tmp_path / "comparison.csv").is_file()
     text = (tmp_path / "comparison.md").read_text(encoding="utf-8")
     assert text.endswith(printed.split("wrote")[0].rstrip() + "\n")
     for name in ("grown_morphogenesis2d_particle-steps.png", "curves_morphogenesis2d.png"):
         assert (tmp_path / name).read_bytes().startswith(b"\x89PNG")
-
     assert main([*words, "--episodes", "5"]) == 2
     assert "other settings: episodes was 4, now 5" in capsys.readouterr().err
 
 
-def test_a_method_that_raises_is_in_the_table_and_the_command_says_so(tmp_path, capsys):
-    assert main(quick_words("evolution", 1000, f"population=1 --out {tmp_path}")) == 1
+def test_a_method_that_fails_is_in_the_table_and_the_command_says_so(tmp_path, capsys, child):
+    child("os._exit(3)")
+    assert main(quick_words("zero", tmp_path)) == 1
     printed = capsys.readouterr().out
-    assert "| evolution | 0, 1 failed | – |" in printed
-    assert "evolution/seed-0 failed: NPAError: population must be a whole number" in printed
-    output = tmp_path / "particle-steps/morphogenesis2d/evolution/seed-0/output.txt"
-    assert "Traceback" in output.read_text(encoding="utf-8")
+    assert "| zero | 0, 1 failed | – |" in printed
+    assert "zero/seed-0 failed: its process ended with code 3" in printed

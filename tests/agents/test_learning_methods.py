@@ -227,7 +227,7 @@ def test_a_loss_without_a_gradient_is_refused(monkeypatch):
 
 @pytest.mark.parametrize(
     ("problem", "iterations", "largest"),
-    [(heart(episode_steps=6), 40, 0.05), (species(episode_steps=6), 20, 0.2)],
+    [slow(heart(episode_steps=6), 40, 0.05), (species(episode_steps=6), 20, 0.2)],
     ids=["heart", "species"],
 )
 def test_a_clone_does_what_its_teacher_does(problem, iterations, largest):

@@ -16,8 +16,8 @@ from npa_envs.errors import MissingDependencyError
 from npa_envs.measure import quality
 from npa_envs.measure.quality import AccuracyRow, EvaluationRow, HealingRow, PictureRow
 from npa_envs.measure.wounds import WoundRow
-from npa_envs.render import world_film
-from npa_envs.training import TASKS
+from npa_envs.render import turntable_frames, world_film
+from npa_envs.training import TASKS, preset
 from npa_envs.training.trainer import JOINT_TASK_NAME
 
 
@@ -27,6 +27,7 @@ def short(monkeypatch):
     monkeypatch.setattr(report, "CHECKPOINTS", (8, 128))
     monkeypatch.setattr(report, "CLOUD_CHECKPOINTS", (8, 32))
     monkeypatch.setattr(report, "FILM_STEPS", 6)
+    monkeypatch.setitem(turntable_frames.__kwdefaults__, "frame_count", 4)
     for name in ("grow_steps", "heal_steps"):
         monkeypatch.setitem(quality.healing.__wrapped__.__kwdefaults__, name, 16)
 
@@ -73,17 +74,12 @@ def test_a_run_of_every_task_ends_with_a_model_card_of_each_rule(task, tmp_path,
             assert min(film.size) >= 256
         (said,) = re.findall(rf"report +{re.escape(str(run / 'report' / stem))}\.md: (.*)", output)
         assert said
+        if task == "morphogenesis2d":
+            again = run / "again.json"
+            command = held["command"].removeprefix("npa-envs ").split()
+            assert main([*command, "--no-progress", "--json", str(again)]) == 0
+            assert json.loads(again.read_text("utf-8"))["growth"] == held["growth"]
     assert {path.name for path in (run / "report").iterdir()} == expected
-
-
-def test_the_metrics_of_a_report_are_those_of_the_command_that_it_names(tmp_path):
-    words = words_of("morphogenesis2d", tmp_path)
-    assert main(words) == 0
-    held = json.loads((tmp_path / "run" / "report" / "rule.json").read_text("utf-8"))
-    _, *command = held["command"].split()
-    assert main([*command, "--no-progress", "--json", str(tmp_path / "again.json")]) == 0
-    again = json.loads((tmp_path / "again.json").read_text("utf-8"))
-    assert again["growth"] == held["growth"]
 
 
 def test_a_run_writes_no_report_where_none_is_wanted_or_no_iteration_was_done(tmp_path, capsys):
@@ -128,12 +124,34 @@ def test_a_report_says_where_worlds_do_not_hold(factor, holds, tmp_path, capsys,
     assert (said in output) is not holds
     commands = re.findall("train on: npa-envs (.*)", output)
     card = (tmp_path / "run" / "report" / "rule.md").read_text("utf-8")
-    assert ("To train on:" in card) is bool(commands)
-    assert commands or holds
-    for command in commands:
-        assert f"npa-envs {command}\n" in card
-        assert main([*command.split(), "--no-progress", "--no-report"]) == 0
-        assert (tmp_path / "run2" / "rule.safetensors").exists()
+    assert "- 2 iterations of the 40 of the preset `tiny`." in card
+    (command,) = commands
+    assert f"To train on:\n\n```sh\nnpa-envs {command}\n" in card
+    assert main([*command.split(), "--no-progress", "--no-report"]) == 0
+    assert "finished: 40 iterations" in capsys.readouterr().out
+    assert (tmp_path / "run2" / "rule.safetensors").exists()
+
+
+def test_a_report_names_the_next_step_of_short_runs_and_what_is_usual_for_the_preset(tmp_path):
+    path, task = tmp_path / "lizard2" / "rule.safetensors", "morphogenesis2d"
+    short = preset("fast", task, target="heart", iterations=60)
+    usual, command = report.next_steps(path, task, short, {})
+    assert usual == ["60 iterations of the 2400 of the preset `fast`"]
+    assert command.endswith(f"--iterations 2400 --out {tmp_path / 'lizard3'}")
+    (tmp_path / "lizard3").mkdir()
+    assert report.next_steps(path, task, short, {})[1].endswith("lizard4")
+    tables = {"healing": [WoundRow("wipe, radius 0.2", 6, 6, 0, 0.1, 1.0, 0.3, scars="top")]}
+    (usual,), command = report.next_steps(path, task, preset("fast", task), tables)
+    assert (usual[:17], command) == ("usual for `fast`;", "")
+    assert report.next_steps(path, task, preset("best", task), tables) == ([], "")
+    assert report.next_steps(path, task, preset("fast", task), {}) == ([], "")
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_a_configuration_is_taken_for_the_preset_that_it_was_made_of(task):
+    for name in TASKS[task].presets:
+        config = preset(name, task, iterations=2, milestones=(), seed=5, device="cuda")
+        assert report.nearest_preset(task, config) == name
 
 
 def test_a_rule_that_cannot_be_measured_is_kept_and_said_to_have_no_report(

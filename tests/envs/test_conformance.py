@@ -47,8 +47,16 @@ SIZED = {row.id: (row.id, {"seed_pool": 2, "grow_steps": 4}) for row in SMALL_GA
 SPECIES = "species"
 """The case of several species, one of which is removed in an episode."""
 
-every_case = pytest.mark.parametrize("case", CASES)
-every_case_and_species = pytest.mark.parametrize("case", [*CASES, SPECIES])
+ALIKE = [f"{garden.id}-{form}" for garden in GARDENS[1:] for form in list(FORMS)[1:]]
+"""Forms of the other gardens, which are those of the first one."""
+
+QUICK = [slow(case) if case in ALIKE else case for case in CASES]
+every_case = pytest.mark.parametrize("case", QUICK)
+every_case_and_species = pytest.mark.parametrize("case", [*QUICK, SPECIES])
+
+
+def paired(second, *cases):
+    return [slow(c, second) if c in {*ALIKE, *SIZED} else (c, second) for c in cases]
 
 
 def leaves(result):
@@ -105,7 +113,7 @@ class TestEveryEnvironment:
         env.action_space.seed(seed)
         return [env.action_space.sample() for _ in range(count)]
 
-    @pytest.mark.parametrize("case", CASES | SIZED)
+    @pytest.mark.parametrize("case", [*CASES, *map(slow, SIZED)])
     def test_gymnasium_and_sb3_find_nothing_to_complain_of(self):
         checker = pytest.importorskip("stable_baselines3.common.env_checker")
         unseen = {"skip_render_check": self.name not in CASES}
@@ -122,7 +130,7 @@ class TestEveryEnvironment:
 
     @pytest.mark.parametrize(
         ("case", "mode"),
-        [(case, "same-step") for case in CASES | SIZED]
+        paired("same-step", *CASES, *SIZED)
         + [((case, "next-step") if case in IDS else slow(case, "next-step")) for case in CASES],
     )
     def test_gymnasiums_own_batches_of_single_worlds_agree_in_all_they_return(self, mode, device):
@@ -199,7 +207,7 @@ class TestEveryEnvironment:
 
     @pytest.mark.parametrize(
         ("case", "mode"),
-        [(case, "same-step") for case in [*CASES, SPECIES]]
+        paired("same-step", *CASES, SPECIES)
         + [(IDS[0], mode) for mode in ("next-step", "disabled")]
         + [slow(name, mode) for name in IDS[1:] for mode in ("next-step", "disabled")]
         + [(SPECIES, "disabled")],
@@ -276,7 +284,7 @@ class TestEveryEnvironment:
 
     @pytest.mark.parametrize(
         ("case", "style"),
-        [(case, "particles") for case in [*CASES, SPECIES]]
+        paired("particles", *CASES, SPECIES)
         + [(SPECIES, "species")]
         + [(name, style) for name in IDS for style in ("density", "states")],
     )

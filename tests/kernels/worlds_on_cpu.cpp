@@ -35,8 +35,10 @@ inline void atomicMax(unsigned* at, unsigned value) { *at = max(*at, value); }
 
 namespace npa {
 
-// float16 numbers as floats, and the nearest float16 of a float.
-const std::vector<float> all_halves = [] {
+// float16 numbers as floats, and the nearest float16 of a float. The compiler would spend seconds on
+// computing a lambda's result itself.
+std::vector<float> every_half()
+{
     std::vector<float> values;
     for (unsigned half = 0; half < 65536; ++half) {
         const int exponent = half >> 10 & 31, digits = half & 1023;
@@ -45,7 +47,8 @@ const std::vector<float> all_halves = [] {
         values.push_back(half & 0x8000 ? -size : size);
     }
     return values;
-}();
+}
+const std::vector<float> all_halves = every_half();
 inline float widened(unsigned half) { return all_halves[half]; }
 inline unsigned narrowed(float value)
 {

@@ -1,6 +1,7 @@
 """Launches: tensors of any strides and sizes, one after the other, are described as they are."""
 
 import collections
+import contextlib
 import threading
 from concurrent.futures import ThreadPoolExecutor
 
@@ -163,11 +164,24 @@ def test_a_check_of_positions_waits_for_late_reports(monkeypatch):
     def launch_later(*arguments):
         threading.Timer(0.05, lambda: late.append(1) or report(*arguments)).start()
 
-    monkeypatch.setattr(position_check, "_is_slow", lambda x: False)
+    monkeypatch.setattr(position_check, "is_slow", lambda x: False)
     monkeypatch.setattr(position_check, "launch", launch_later)
     with position_check.checked_positions(torch.zeros(1, 4, 2)):
         assert not late
     assert late
+
+
+def test_a_check_ignores_late_reports_of_one_that_nobody_waited_for(monkeypatch):
+    report, x = position_check.launch, torch.zeros(1, 4, 2)
+    late = lambda *arguments: threading.Timer(0.05, report, arguments).start()  # noqa: E731
+    monkeypatch.setattr(position_check, "is_slow", lambda x: False)
+    for first, second in [(x, x / 0.0), (x / 0.0, x)]:
+        monkeypatch.setattr(position_check, "launch", late)
+        position_check.PositionCheck(first)
+        monkeypatch.setattr(position_check, "launch", report)
+        expected = pytest.raises(npa_envs.NPAError) if first is x else contextlib.nullcontext()
+        with expected:
+            position_check.PositionCheck(second).wait()
 
 
 @pytest.mark.parametrize("fast", [False, True])
@@ -175,7 +189,7 @@ def test_a_check_of_positions_waits_for_late_reports(monkeypatch):
 def test_positions_that_are_not_finite_are_refused_by_all_checks(size, fast, device, monkeypatch):
     if fast:
         # On a CPU as well, threads report.
-        monkeypatch.setattr(position_check, "_is_slow", lambda x: False)
+        monkeypatch.setattr(position_check, "is_slow", lambda x: False)
     x, s = random_world(1, size, 2, 1, dtype=torch.float32, device=device)
     # Beside a multiple of what a thread reads at once.
     for k in {0, size // 3, size - 1}:

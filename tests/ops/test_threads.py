@@ -104,21 +104,12 @@ with multiprocessing.get_context("fork").Pool(2) as pool:
 """
 
 
-def printed(program, threads):
-    """Return the lines that a program prints in a process of its own."""
-    done = run_alone(ROLLOUT + program, OMP_NUM_THREADS=str(threads))
-    assert done.returncode == 0, done.stderr
-    return done.stdout.split("\n")[:-1]
-
-
-def test_several_threads_may_make_and_load_the_same_kernels_first():
-    assert printed(FIRST_CALLS, 1) == ["[True, True, True, True]"]
-
-
 @needs_fork
-def test_a_forked_pool_rolls_out_and_starts_its_own_threads():
+def test_several_threads_make_the_same_kernels_first_and_a_forked_pool_starts_its_own_threads():
     """Its parent's threads do not run there: what they are given would never be done."""
-    assert printed(FORKED_POOL, 2) == [str([[True, True, True]] * 2)]
+    done = run_alone(ROLLOUT + FIRST_CALLS + FORKED_POOL, OMP_NUM_THREADS="2")
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.splitlines() == [str([True] * 4), str([[True, True, True]] * 2)]
 
 
 @needs_fork

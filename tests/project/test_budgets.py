@@ -167,7 +167,7 @@ BUDGETS = {
         9_000_000,
     ),
     "files of results": Budget(
-        lambda: sum(p.is_file() for p in (ROOT / "benchmarks" / "results").rglob("*")), 58, 58
+        lambda: sum(p.is_file() for p in (ROOT / "benchmarks" / "results").rglob("*")), 59, 59
     ),
 }
 """What is counted, the most that there may be now, and the most that there is to be."""

@@ -1,6 +1,7 @@
 """The documentation is true: pages are current, tables name what is there, code runs."""
 
 import contextlib
+import functools
 import importlib
 import json
 import math
@@ -36,9 +37,6 @@ ROOT = Path(__file__).resolve().parents[2]
 EXAMPLES = draw_examples.EXAMPLES
 DOCS = ROOT / "docs"
 TEXTS = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted(DOCS.rglob("*.md"))]
-
-every_text = pytest.mark.parametrize("path", TEXTS, ids=lambda p: p.relative_to(ROOT).as_posix())
-every_environment = pytest.mark.parametrize("name", [row.name for row in ENVIRONMENTS])
 
 
 @pytest.fixture(autouse=True)
@@ -79,6 +77,7 @@ def first_cells(text: str) -> list[str]:
     return [name for cell in cells for name in re.findall(r"`([^`]+)`", cell)]
 
 
+@functools.cache
 def anchors(path: Path) -> set[str]:
     titles = re.findall(r"^#+ (.+)$", path.read_text(encoding="utf-8"), re.MULTILINE)
     return {re.sub(r"[^\w\- ]", "", title).strip().lower().replace(" ", "-") for title in titles}
@@ -166,15 +165,15 @@ def test_the_home_page_has_four_doors_with_pictures():
         assert re.search(rf"^\[!\[[^\]]+\]\(images/[^)]+\)\]\({page}\)$", door, re.MULTILINE)
 
 
-@every_text
-def test_links_lead_somewhere(path):
-    for target in re.findall(r"\]\(([^)\s]+)\)", path.read_text(encoding="utf-8")):
-        if target.startswith("http"):
-            continue
-        name, _, anchor = target.partition("#")
-        there = (path.parent / name).resolve() if name else path
-        assert there.exists(), f"{target} is not there"
-        assert not anchor or anchor in anchors(there), f"{there.name} has no heading {anchor}"
+def test_links_lead_somewhere():
+    for path in TEXTS:
+        for target in re.findall(r"\]\(([^)\s]+)\)", path.read_text(encoding="utf-8")):
+            if target.startswith("http"):
+                continue
+            name, _, anchor = target.partition("#")
+            there = (path.parent / name).resolve() if name else path
+            assert there.exists(), f"{path.name}: {target} is not there"
+            assert not anchor or anchor in anchors(there), f"{there.name} has no heading {anchor}"
 
 
 # Pages of environments.
@@ -183,7 +182,7 @@ MODULES = {"MultiSpecies": multispecies_v0, "Particles": particles_v0}
 every_module = pytest.mark.parametrize("name", MODULES)
 
 
-@every_environment
+@pytest.mark.parametrize("name", [row.name for row in ENVIRONMENTS])
 def test_the_example_of_a_page_runs(name):
     # Small worlds: what is tested is that the calls are right. Pictures take a second each to draw.
     fields = "particle_count=64, eps=0.3"
@@ -289,8 +288,8 @@ PROGRAMS = {
         "stable_baselines3",
     ),
     "training": Program(
-        ("model.num_timesteps == 2048", "model.action_space.shape == (32,)"),
-        (("37_000", "8"),),
+        ("model.num_timesteps == 64", "model.action_space.shape == (32,)"),
+        (("37_000", "8"), (r'v0"\)', r'v0"), n_steps=64')),
         library="stable_baselines3",
     ),
     "textures": Program(("printed.count('tensor([') == 2",)),
@@ -550,11 +549,11 @@ def test_weights_and_biases_follows_the_logs(folder, monkeypatch):
 
 @foreign
 def test_films_of_gymnasium(folder):
-    run_integration(2, "moviepy")
+    run_integration(2, "moviepy", ("24", "12"))
     for name, side in (("one", 256), ("four", 512)):
         film = imageio.imread(next((folder / "films" / name).glob("*.mp4")))
-        # The first picture and 24 steps; moviepy 1.0.3 may show the last one twice.
-        assert len(film) in (25, 26)
+        # The first picture and 12 steps; moviepy 1.0.3 may show the last one twice.
+        assert len(film) in (13, 14)
         assert film.shape[1:] == (side, side, 3)
         assert abs(film[-1].astype(float) - film[0]).mean() > 1.0
 

@@ -3,15 +3,12 @@
 import runpy
 from pathlib import Path
 
-import pytest
-
 RUNNER = runpy.run_path(str(Path(__file__).resolve().parents[1] / "faults" / "run.py"))
 FAULTS = RUNNER["faults"]()
 
 
-@pytest.mark.parametrize("fault", FAULTS, ids=[fault["name"] for fault in FAULTS])
-def test_a_fault_can_be_put_where_its_text_stands_once(fault):
-    assert RUNNER["stale"](fault) is None
+def test_a_fault_can_be_put_where_its_text_stands_once():
+    assert [found for fault in FAULTS if (found := RUNNER["stale"](fault)) is not None] == []
 
 
 def test_there_are_forty_faults_of_different_names():

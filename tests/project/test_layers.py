@@ -147,9 +147,9 @@ def violations(module: str, source: str) -> list[str]:
     return wrong
 
 
-@pytest.mark.parametrize("path", source_files(), ids=lambda p: p.relative_to(ROOT).as_posix())
-def test_every_source_file_keeps_to_the_layers(path: Path) -> None:
-    assert violations(module_name(path), path.read_text(encoding="utf-8")) == []
+def test_every_source_file_keeps_to_the_layers() -> None:
+    modules = {module_name(path): path.read_text(encoding="utf-8") for path in source_files()}
+    assert [text for module in modules.items() for text in violations(*module)] == []
 
 
 @pytest.mark.parametrize(

@@ -4,16 +4,12 @@ import functools
 import re
 from pathlib import Path
 
-import pytest
-
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
 FOLDERS = ("npa_envs", "envs", "wrappers", "agents", "docs", "benchmarks", "tests")
 SUFFIXES = "py|cuh|js|md|toml|json|txt|ipynb"
 FENCE = re.compile(r"^ *```.*?^ *```$", re.MULTILINE | re.DOTALL)
 NAME = r"[A-Za-z_]\w*(?:\.\w+)*"
-
-every_page = pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
 
 
 @functools.cache
@@ -52,32 +48,33 @@ def prose(page: Path) -> str:
     return FENCE.sub("", page.read_text(encoding="utf-8"))
 
 
-@every_page
-def test_files_in_code_exist(page):
+def test_files_in_code_exist():
     """A file without a folder may be what a program writes, or a page's own program."""
-    named = re.findall(rf"`((?:{'|'.join(FOLDERS)})/[\w./]*|[\w/.]+\.(?:{SUFFIXES}))`", prose(page))
-    named = [name for name in named if not re.search("[A-Z]{4}", name) and path_of(name) is None]
-    written = {page.stem, *known_words()}
-    assert [name for name in named if Path(name).stem not in written] == []
+    pattern = rf"`((?:{'|'.join(FOLDERS)})/[\w./]*|[\w/.]+\.(?:{SUFFIXES}))`"
+    named = {(page.stem, name) for page in PAGES for name in re.findall(pattern, prose(page))}
+    named = {(s, n) for s, n in named if not re.search("[A-Z]{4}", n) and path_of(n) is None}
+    assert [(s, n) for s, n in named if Path(n).stem not in {s, *known_words()}] == []
 
 
-@every_page
-def test_a_file_contains_what_a_page_says_that_it_defines(page):
-    text = page.read_text(encoding="utf-8")
-    # In drawings: file name
-    pairs = re.findall(rf"((?:npa_envs|envs|world|ops|rule)/[\w/]+\.py):? +({NAME}) ", text)
-    # `name` in `file`
-    pairs += [(file, n) for n, file in re.findall(rf"`({NAME})`\s(?:in|of)\s`([\w/]+\.py)`", text)]
-    # `file`: `name`, `name`; and `file` (`name`)
-    lists = re.findall(
-        r"`([\w/]+\.(?:py|js))`(?:: ([^;]+?)(?=;|\n\n|\n-|`[\w/]+\.)| \(([^)]+)\))", text
-    )
-    pairs += [(file, n) for file, *rest in lists for n in re.findall(f"`({NAME})`", str(rest))]
-    assert len(pairs) > 100 or page.stem != "architecture", "most are written in another form"
-    for file, name in (pair for pair in pairs if "NAME" not in pair[0]):
-        path = path_of(file)
-        assert path is not None, file
-        # A member may be of a base class in another file.
-        owner, *members = name.split(".")
-        assert owner in words_of(path), (file, name)
-        assert known_words().issuperset(members), (file, name)
+def test_files_contain_what_pages_say_that_they_define():
+    for page in PAGES:
+        text = page.read_text(encoding="utf-8")
+        # In drawings: file name
+        pairs = re.findall(rf"((?:npa_envs|envs|world|ops|rule)/[\w/]+\.py):? +({NAME}) ", text)
+        # `name` in `file`
+        pairs += [
+            (file, n) for n, file in re.findall(rf"`({NAME})`\s(?:in|of)\s`([\w/]+\.py)`", text)
+        ]
+        # `file`: `name`, `name`; and `file` (`name`)
+        lists = re.findall(
+            r"`([\w/]+\.(?:py|js))`(?:: ([^;]+?)(?=;|\n\n|\n-|`[\w/]+\.)| \(([^)]+)\))", text
+        )
+        pairs += [(file, n) for file, *rest in lists for n in re.findall(f"`({NAME})`", str(rest))]
+        assert len(pairs) > 100 or page.stem != "architecture", "most are written in another form"
+        for file, name in (pair for pair in pairs if "NAME" not in pair[0]):
+            path = path_of(file)
+            assert path is not None, file
+            # A member may be of a base class in another file.
+            owner, *members = name.split(".")
+            assert owner in words_of(path), (file, name)
+            assert known_words().issuperset(members), (file, name)

@@ -32,8 +32,8 @@ import sys
 # and -S the installed torch.
 sys.meta_path = [finder for finder in sys.meta_path if "editable" not in repr(finder)]
 sys.path.insert(1, sys.argv[1])
-import npa_envs, npa_envs.envs, npa_envs.wrappers, npa_envs.agents
-for module in (npa_envs, npa_envs.envs, npa_envs.wrappers, npa_envs.agents): print(module.__file__)
+from importlib.util import find_spec
+for name in ("", ".envs", ".wrappers", ".agents"): print(find_spec("npa_envs" + name).origin)
 """
 
 

@@ -7,7 +7,7 @@ from test_rule_files import assert_same_rule
 
 import npa_envs
 from npa_envs.errors import NPAError
-from npa_envs.rule.rule import with_codes
+from npa_envs.rule.rule import enlarged
 
 NAMES = ("gecko", "heart", "ring")
 
@@ -109,9 +109,9 @@ def test_what_does_not_go_together_is_refused(call, message):
         call()
 
 
-def test_a_rule_without_codes_gives_its_weights_to_one_with_codes():
+def test_a_rule_without_codes_gives_its_weights_to_one_enlarged():
     plain = lively_rule("cpu", state_dim=4, eps0=0.3)
-    wider = with_codes(plain, coded(hidden_dim=20))
+    wider = enlarged(plain, coded(hidden_dim=20))
     x, s = world_of(wider)
     wider_s = wider.with_code(s, torch.zeros(3))
     with torch.no_grad():
@@ -123,4 +123,4 @@ def test_a_rule_without_codes_gives_its_weights_to_one_with_codes():
     assert_near(ours[0], theirs[0], 1e-12)
     assert_near(ours[1][..., 3:], theirs[1], 1e-12)
     other = lively_rule("cpu", state_dim=6, eps0=0.3)
-    assert with_codes(other, coded()) is other
+    assert enlarged(other, coded()) is other

@@ -128,10 +128,12 @@ def test_training_gives_its_rule_the_zone_and_the_inverse(tmp_path, field, begun
 def test_a_rule_acts_only_where_its_choice_is_observed():
     rule = NPARule(moment_inverse="smooth")
     env = gymnasium.make("npa/Morphogenesis2D-v0", particle_count=32)
-    refused("the environment with moment_inverse='smooth'", RulePolicy, rule, env)
+    refused("the environment with the keyword moment_inverse='smooth'", RulePolicy, rule, env)
     env = gymnasium.make("npa/Morphogenesis2D-v0", particle_count=32, moment_inverse="smooth")
     RulePolicy(rule, env)
-    with pytest.raises(NPAError, match="moment_inverse must be a known word, got 'soft'"):
+    with pytest.raises(
+        NPAError, match="moment_inverse must be 'threshold' or 'smooth', got 'soft'"
+    ):
         gymnasium.make("npa/Morphogenesis2D-v0", moment_inverse="soft")
 
 

@@ -528,7 +528,7 @@ def test_a_printed_rule_begins_with_what_calls_need():
 def test_missing_files_and_folders_are_named(tmp_path, monkeypatch):
     (tmp_path / "rule.bin").touch()
     known = r"must end in \.safetensors, \.pth, \.pt, \.json"
-    refused(f"{known}.*rule.bin': rename it", load_rule, tmp_path / "rule.bin")
+    refused(f"{known}.*rule.bin': give the file of a rule", load_rule, tmp_path / "rule.bin")
     (tmp_path / "house.png").touch()
     train = r"house.png': npa-envs train morphogenesis2d --target '.*/house.png' trains a rule"
     refused(f"{known}.*{train}", load_rule, tmp_path / "house.png")
@@ -536,7 +536,7 @@ def test_missing_files_and_folders_are_named(tmp_path, monkeypatch):
     refused("truncated one: download or copy it again", load_rule, tmp_path / "broken.pth")
     for suffix in ("safetensors", "pth", "json"):
         path = tmp_path / f"rule.{suffix}"
-        refused(f"rule.{suffix}.*does not exist: check", load_rule, path)
+        refused(f"rule from '[^']*rule.{suffix}': it does not exist: check", load_rule, path)
         path.mkdir()
         refused(f"rule.{suffix}", load_rule, path)
     monkeypatch.chdir(tmp_path)

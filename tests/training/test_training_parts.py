@@ -234,7 +234,7 @@ def test_what_names_no_device_is_refused(names, rule):
 def test_a_cuda_device_must_be_there(monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     for name in ("cuda", "cuda:0", torch.device("cuda", 1)):
-        refused(r"got 'cuda.*sees 0 CUDA devices: use device='cpu'", check_device, name)
+        refused(r"got 'cuda.*sees 0 CUDA devices: use 'cpu'", check_device, name)
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
     assert check_device("cuda") == torch.device("cuda:0")

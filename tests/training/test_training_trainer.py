@@ -441,7 +441,7 @@ def test_checkpoint_of_another_task_or_configuration_is_refused(tmp_path):
     train(override(config, repeats=2))
     for changes, options, message in (
         ({}, {"task_name": "square"}, "is of task 'circle', not of 'square'"),
-        ({"learning_rate": 0.5}, {}, r"learning_rate: 0.01 there, 0.5 here.*initial_rule="),
+        ({"learning_rate": 0.5}, {}, r"learning_rate: 0.01 there, 0.5 here.*with the initial rule"),
         ({"target": "heart"}, {}, r"task.target: 'gecko' there, 'heart' here"),
         ({}, {}, "at iteration 12, beyond the 6 of this run: raise repeats"),
     ):

@@ -55,6 +55,9 @@ def test_an_exported_page_lives_and_is_touched(exported):
     assert 0 < page.wait(f"{COUNT} < 512 && {COUNT}") < 512
     page.run("document.page.send({ type: 'set', name: 'eps', value: 0.12 })")
     page.wait("document.page.world.settings.eps.value === 0.12")
+    page.run("document.getElementById('trained').click()")
+    page.wait("document.page.world.settings.eps.value === 0.1")
+    assert page.run("document.getElementById('trained').disabled")
     page.wait(f"{STEP} > {page.run(STEP)} + 2")
     # Another world may come before a frame of the last one was drawn.
     before = page.run(STEP)

@@ -126,15 +126,81 @@ def test_a_page_begins_with_a_brush_that_heals_and_says_what_it_does(run):
     assert shown == [["wipe", wiping], 10, ["remove", removing], "look"]
 
 
+def test_another_world_begins_with_wipe_or_the_chosen_brush_and_is_asked_for_its_loss(run):
+    brushes, losses, curves = run("""
+        const mine = { ...world, title: "mine", capabilities: ["film"] };
+        const learned = { ...mine, capabilities: ["film", "loss"] };
+        element("plots").open = true;
+        const brushes = ["look", "cut"].map((first) => {
+          listen(world);
+          page.brushes.choose(first);
+          listen({ ...world, seed: 1 });
+          const names = [page.brushes.chosen.name];
+          listen(mine);
+          names.push(page.brushes.chosen.name);
+          if (first === "look") page.brushes.choose("look");
+          listen({ ...mine, seed: 2 });
+          names.push(page.brushes.chosen.name);
+          listen(learned);
+          return [...names, page.brushes.chosen.name];
+        });
+        sent.length = 0;
+        const losses = [world, { ...world, seed: 3 }, mine, learned].map((event) => {
+          sent.length = 0;
+          listen(event);
+          return ofType("set").map(({ name, value }) => [name, value].join());
+        });
+        listen({ type: "curve", name: "Training loss", points: [[0, 1]] });
+        const curves = [learned, world].map((event) => {
+          listen(event);
+          return Object.keys(page.curves);
+        });
+        return [brushes, losses, curves];
+    """)
+    assert brushes == [["look", "wipe", "look", "wipe"], ["cut"] * 4]
+    assert losses == [["loss,true"], [], ["loss,true"], ["loss,true"]]
+    assert curves == [["Training loss"], []]
+
+
+def test_a_plot_of_the_loss_is_shown_where_there_is_one(run):
+    hidden = run("""
+        return [[["film"], ["a"]], [["loss"], ["a"]], [["loss"], ["a", "b"]]].map(
+          ([capabilities, species]) => {
+            listen({ ...world, capabilities, species });
+            return page.plots.loss.figure.hidden;
+          });
+    """)
+    assert hidden == [True, False, True]
+
+
+def test_the_physics_is_put_back_as_trained_where_it_differs(run):
+    sent, disabled = run("""
+        const setting = (value, trained) => ({ value, trained, low: 0.01, high: 99, scale: null });
+        const settings = { speed: setting(4, 1), eps: setting(0.1, 0.1), count: setting(9, 9) };
+        const event = { ...world, settings };
+        const states = [event, { ...event, settings: {
+          ...settings, eps: setting(0.2, 0.1), count: setting(5, 9) } }].map((one) => {
+          listen(one);
+          return element("trained").disabled;
+        });
+        sent.length = 0;
+        element("trained").onclick();
+        return [ofType("set").map(({ name, value }) => [name, value]), states];
+    """)
+    assert disabled == [True, False]
+    assert sent == [["eps", 0.1], ["count", 9]]
+
+
 def test_graft_is_offered_where_another_rule_fits_and_species_shown_where_there_are_two(run):
     offered = run("""
         return [["a"], ["a", "b"]].map((others) => {
           listen({ ...world, others, species: others, shows: ["colours", "species"] });
           const brushes = element("brushes").children.map((one) => one.dataset.brush);
-          return [brushes.includes("graft"), element("show").dataset.names];
+          const shows = element("show").dataset.names, { hidden } = element("other-field");
+          return [brushes.includes("graft"), hidden, shows];
         });
     """)
-    assert offered == [[False, "colours"], [True, "colours\nspecies"]]
+    assert offered == [[False, True, "colours"], [True, False, "colours\nspecies"]]
 
 
 def test_all_that_a_page_shows_has_a_meaning(run):

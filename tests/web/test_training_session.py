@@ -22,10 +22,11 @@ from support.clock import wait_until
 
 from npa_envs import NPAError, load_rule, save_rule
 from npa_envs.rule.files import rule_metadata, shipped_rules
+from npa_envs.training.task_of_rule import trained_config
 from npa_envs.training.task_table import task_entry
 from npa_envs.web import dropped_file, training_session
 from npa_envs.web.dropped_file import read_dropped, stored_name
-from npa_envs.web.training_session import OLD, LearningWorld, Training
+from npa_envs.web.training_session import LearningWorld, Training
 
 pytest.importorskip("uvicorn")
 testclient = pytest.importorskip("starlette.testclient")
@@ -212,29 +213,100 @@ def test_a_mesh_of_too_many_triangles_is_refused(tmp_path, monkeypatch):
         read_dropped(path)
 
 
-def test_an_old_world_begins_again_with_a_later_rule_and_once_more_at_the_end(tmp_path):
-    rule = load_rule("heart")
+def save_heart(rule, path: Path) -> None:
+    """Save a rule as if trained like the shipped heart."""
     metadata = rule_metadata(shipped_rules()["heart"])
-    metadata = {name: metadata[name] for name in ("task", "config")}
-    save_rule(rule, tmp_path / "rule.safetensors", metadata=metadata)
+    save_rule(rule, path, metadata={name: metadata[name] for name in ("task", "config")})
+
+
+@pytest.fixture
+def learning(tmp_path):
+    """The world of a training that learns the shipped heart, the training, its configuration."""
+    save_heart(load_rule("heart"), path := tmp_path / "rule.safetensors")
     training = Training(tmp_path)
     training._set(state="learning", id="x", name="heart.png", folder=str(tmp_path), has_rule=True)
     world = LearningWorld(training, device=CPU)
-    assert world.describe()["title"] == "heart.png"
-    for step, after in ((OLD, 0), (OLD - 1, OLD - 1)):
-        world.step = step
-        with torch.no_grad():
-            rule.hidden.bias += 0.01
-        save_rule(rule, tmp_path / "rule.safetensors", metadata=metadata)
-        world._poll()
-        assert world.step == after
-        assert torch.equal(world.main.rule.hidden.bias, rule.hidden.bias)
+    config = trained_config(path, rule_metadata(path))
+    # Without steps of the rule, which would take long.
+    world._rollout = lambda *_: torch.zeros(world.particles.x.shape[:2])
+    return world, training, config
+
+
+def age_at_which_it_begins_again(world, ages) -> int | None:
+    for age in ages:
+        world.step = age - 1
+        world._run(1)
+        if world.step == 0:
+            return age
+    return None
+
+
+def test_a_world_of_an_early_rule_begins_again_after_four_rollouts_and_a_later_ones_lives_longer(
+    learning,
+):
+    world, training, config = learning
+    early, longest = 4 * config.steps[1], config.max_age_range[1]
+    assert age_at_which_it_begins_again(world, [early - 1, early, early + 1]) == early
+    training._set(iteration=500, total=1000)
+    ages = [early, longest // 2 - 1, longest // 2]
+    assert age_at_which_it_begins_again(world, ages) == longest // 2
+    training._set(state="done")
+    assert age_at_which_it_begins_again(world, [longest, 10 * longest]) is None
+
+
+def test_what_a_brush_has_done_is_seen_for_another_life(learning):
+    world, _, config = learning
+    life = 4 * config.steps[1]
+    world.step = life - 10
+    wipe = {"type": "brush", "tool": "wipe", "at": [0.0, 0.0], "move": [0.0, 0.0], "radius": 0.1}
+    world.handle(wipe)
+    ages = [life, 2 * life - 11, 2 * life - 10]
+    assert age_at_which_it_begins_again(world, ages) == 2 * life - 10
+    assert age_at_which_it_begins_again(world, [life - 1, life]) == life
+
+
+def test_a_world_that_leaves_the_view_begins_again_while_it_learns(learning):
+    world, training, _ = learning
+    for share, state, step in ((0.01, "learning", 1), (0.1, "learning", 0), (0.1, "done", 1)):
+        training._set(state=state)
+        world.reset(0)
+        strays = round(share * world.count)
+        world.particles.x[0, :strays, 1] = -1.01 * world.task.frame.half_width
+        world._run(1)
+        assert world.step == step
+
+
+def test_a_world_takes_later_rules_and_begins_once_more_at_the_end(learning):
+    world, training, _ = learning
+    rule = load_rule("heart")
+    with torch.no_grad():
+        rule.hidden.bias += 0.01
+    save_heart(rule, world._run_folder.rule)
+    world.step = 5
+    world._poll()
+    assert world.step == 5
+    assert torch.equal(world.main.rule.hidden.bias, rule.hidden.bias)
     training._set(state="done")
     world._poll()
     assert world.step == 0
     world.step = 5
     world._poll()
     assert world.step == 5
+
+
+def test_a_world_is_called_by_its_picture_and_has_a_loss_once_it_has_learned(learning):
+    world, training, _ = learning
+    shown, name = world.describe(), "heart.png"
+    assert (shown["title"], shown["others"], shown["species"]) == (name, [name], [name])
+    assert shown["capabilities"] == ["film"]
+    add = {"type": "brush", "tool": "add", "at": [0.5, 0.0], "radius": 0.1, "rule": name}
+    world.handle(add)
+    assert len(world.particles.x[0]) > world.count
+    world.take_events()
+    training._set(state="done")
+    world._poll_due = 0.0
+    shown = [event for event in world.take_events() if event["type"] == "world"][-1]
+    assert shown["capabilities"] == ["film", "loss"]
 
 
 def test_a_learned_rule_stays_where_the_next_file_comes_at_once(tmp_path, monkeypatch):

@@ -43,6 +43,8 @@ def replays(monkeypatch):
     cls = captured_rollout.CapturedRollout
     monkeypatch.setattr(captured_rollout, "capture", capture)
     monkeypatch.setattr(captured_rollout, "_views", lambda tensors: tensors)
+    # As on CUDA, the graph checks positions, and its threads report.
+    monkeypatch.setattr(captured_rollout, "is_slow", lambda x: False)
     monkeypatch.setattr(cls, "_warm_up", warm_up)
     monkeypatch.setattr(cls, "_wait_for_last_use", lambda rollout: None)
     monkeypatch.setattr(capture_cache, "_may_capture", lambda x: True)

@@ -118,6 +118,7 @@ class Page {
 
   readWorld(event) {
     const before = this.world, world = { ...BLANK, ...event };
+    const another = !this.described || before.title !== world.title || before.dimension !== world.dimension;
     this.world = world;
     if (!this.described || before.dimension !== world.dimension || before.half_width !== world.half_width) {
       this.camera = new Camera(world.dimension, world.half_width, world.centre);
@@ -125,17 +126,25 @@ class Page {
       $("loading").hidden = false;
       // Also for undrawn frames of the former world: the engine waits for each.
       this.reportDrawn();
+    }
+    // Another world, or one whose training has ended: its capabilities grow.
+    if (another || before.capabilities.length !== world.capabilities.length) {
       const first = world.dimension === 2 ? world.tools[0]?.name : "look", { name: chosen } = this.brushes.chosen;
       const keeps = before.dimension === world.dimension && this.brushes.offered.slice(1).some(({ name }) => name === chosen);
       this.brushes.choose(keeps ? chosen : first);
+      if ($("plots").open) this.send({ type: "set", name: "loss", value: true });
     }
-    if (before.rule !== world.rule || before.seed !== world.seed) {
+    if (another) {
+      Object.values(this.curves).forEach(({ figure }) => figure.remove());
+      this.curves = {};
+    }
+    if (another || before.seed !== world.seed) {
       this.tracers.clear();
       this.acted = null;
       Object.values(this.plots).forEach((plot) => plot.clear());
     }
     this.described = true;
-    this.plots.loss.figure.hidden = !world.capabilities.includes("loss");
+    this.plots.loss.figure.hidden = !world.capabilities.includes("loss") || world.species.length > 1;
     this.controls.show(world, before);
     this.dirty = true;
   }
@@ -448,6 +457,9 @@ class Controls {
     $("play").onclick = () => page.play(!page.world.playing);
     $("one").onclick = () => { page.play(false); page.send({ type: "step" }); };
     $("reset").onclick = () => page.send({ type: "reset" });
+    $("trained").onclick = () => {
+      for (const [name, { trained: value }] of changed(page.world)) page.send({ type: "set", name, value });
+    };
     $("fold").onclick = () => this.fold(!$("panel").hidden);
     for (const one of [$("rule"), $("choice")])
       one.onchange = () => page.send({ type: "set", name: "rule", value: one.value });
@@ -488,7 +500,7 @@ class Controls {
       ? `Which class each particle takes this for: ${classes.join(", ")}; grey where it is not sure.`
       : MEANINGS[world.show.split(" ")[0]];
     $("rule-field").hidden = $("choice").hidden = world.rules.length < 2;
-    $("other-field").hidden = !world.tools.some(({ takes }) => takes === "rule");
+    $("other-field").hidden = world.others.length < 2 || !world.tools.some(({ takes }) => takes === "rule");
     $("brush").hidden = !world.tools.length;
     this.showBrushes();
     this.page.brushes.showHint();
@@ -501,6 +513,7 @@ class Controls {
       $(name).parentElement.hidden = !world.settings[name];
       if (world.settings[name]) this.slider($(name), name, world.settings[name]);
     }
+    $("trained").disabled = !changed(world).length;
   }
 
   fold(away) {
@@ -655,6 +668,11 @@ function options(select, names, chosen, words = {}) {
     select.replaceChildren(...names.map((name) => new Option(words[name] ?? name, name)));
   }
   if (chosen) select.value = chosen;
+}
+
+// The settings of the physics that are not those that the rule was trained with.
+function changed({ settings }) {
+  return Object.entries(settings).filter(([name, { value, trained }]) => PHYSICS.includes(name) && value !== trained);
 }
 
 // The components from 0 to 1 of a colour such as "rgb(13, 16, 23)".
