@@ -39,6 +39,7 @@ def task_of_rule(
     device: torch.device,
     *,
     particle_count: int | None = None,
+    for_page: bool = False,
     **fields: Any,
 ) -> TrainedTask:
     """Return the task that a rule was trained on, read from its file.
@@ -54,6 +55,7 @@ def task_of_rule(
         rule: The rule.
         device: Device of the task's target.
         particle_count: Particles N; None: as trained.
+        for_page: Whether an exported page runs it, whose user need not hear how to get the data.
         fields: Fields of the task's configuration to change; None: unchanged.
 
     Raises:
@@ -95,7 +97,9 @@ def task_of_rule(
         if chosen or not known_names:
             raise
         if clouds:
-            left_out(source, str(error), what="scikit-learn's digits instead")
+            page = "its page shows scikit-learn's digits", "its data set is not on this computer"
+            what, why = page if for_page else ("scikit-learn's digits instead", str(error))
+            left_out(source, why, what=what)
         why_not_measurable = f"its {name} cannot be loaded: {error}"
         config = override(config, **{name: known_names[0]})
         task = entry.make(config.task, device).held_out()

@@ -130,8 +130,10 @@ def export_web(
     # Opened first: an error in the path is reported before the slow growth of previews.
     with atomic_path(path) as temporary:
         rules = [page_rule(source, particle_count=particle_count) for source in texts]
+        # From 2 on: these are clear among scikit-learn's.
+        digits = {name: k for k, name in enumerate((r["name"] for r in rules if r["classes"]), 2)}
         pictures = {
-            name: preview(source, particle_count=particle_count)
+            name: preview(source, particle_count=particle_count, digit=digits.get(name))
             for name, source in zip(names, texts, strict=True)
             if previews
         }
@@ -157,7 +159,7 @@ def page_rule(source: str, *, particle_count: int | None = None) -> dict[str, An
     `source` is a rule as for `load_rule`; `particle_count` None: as trained.
     """
     check_browser_rule(load_rule(source), rule_name(source))
-    live = RuleWorld(source, device=torch.device("cpu"), particle_count=particle_count, choices={})
+    live = RuleWorld(source, device=torch.device("cpu"), particle_count=particle_count, alone=True)
     rule, task = live.main.rule, live.task
     seed: dict[str, Any]
     if task.classifies:
@@ -212,9 +214,11 @@ def check_browser_rule(rule: NPARule, name: str) -> None:
             raise NPAError(f"a page runs rules {condition}, {shown(name)} {actual}: {hint}")
 
 
-def preview(source: str, *, particle_count: int | None = None) -> str:
-    """Return a picture of a rule's world after some steps, as the data URL of a WebP file."""
-    live = RuleWorld(source, device=torch.device("cpu"), particle_count=particle_count, choices={})
+def preview(source: str, *, particle_count: int | None = None, digit: int | None = None) -> str:
+    """Return a picture of a world, if possible of `digit`, after some steps: a WebP's data URL."""
+    live = RuleWorld(source, device=torch.device("cpu"), particle_count=particle_count, alone=True)
+    while digit is not None and live.goal != digit and live.seed < 99:
+        live.reset(None)
     live.speed = 256 if live.task.aligned else 128
     live.advance()
     with torch.no_grad():
@@ -266,7 +270,7 @@ def page_text(
         ('<link rel="stylesheet" href="page.css">', f"<style>{style}</style>"),
         (
             '<script type="module" src="server_connection.js"></script>',
-            f"{_gallery(title, previews) if previews else ''}"
+            f"{_gallery(title, previews, rules) if previews else ''}"
             f'<script type="application/json" id="rules">{data}</script>\n'
             f'<script type="text/plain" id="worker">{worker}</script>\n'
             f'<script type="module">{code}</script>',
@@ -297,16 +301,17 @@ Wipe a part and watch.</p>
 </details>"""
 
 
-def _gallery(title: str, previews: Mapping[str, str]) -> str:
+def _gallery(title: str, previews: Mapping[str, str], rules: Sequence[Mapping[str, Any]]) -> str:
+    captions = {r["name"]: " <small>classifies digits</small>" for r in rules if r["classes"]}
     links = "\n".join(
         f'<li><a href="#{quote(name, safe="")}"><img src="{picture}" alt="">'
-        f"<span>{html.escape(name)}</span></a></li>"
+        f"<span>{html.escape(name)}{captions.get(name, '')}</span></a></li>"
         for name, picture in previews.items()
     )
     return f"""<section id="gallery">
 <h1>{html.escape(title)}</h1>
 <p>Small neural networks, one in every particle.
-Choose one, watch it grow, then wipe a part of it: it heals.</p>
+Choose one and watch it. Wipe a part of what has grown: it heals.</p>
 <ul>
 {links}
 </ul>

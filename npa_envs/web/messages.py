@@ -88,7 +88,8 @@ class TrainingEvent(TypedDict, total=False):
     note: str  # What was read, or "".
     preset: str  # Name of the run's preset.
     picture: str  # Name of the picture that is learned, a file to download.
-    message: str  # Why it has failed.
+    message: str  # Why it has failed, or has learned nothing.
+    refused: str  # Name of a later file of which `message` and `cure` are: it left no rule.
     cure: Literal["whole"]  # Upload again with this keyword, which keeps the background.
     has_rule: bool  # Whether there is a rule to show and download.
     iteration: int

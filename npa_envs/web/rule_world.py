@@ -66,6 +66,7 @@ class RuleWorld(LiveWorld):
         seed: Seed of the first world.
         particle_count: Particles of a newly seeded world; None: as trained.
         choices: Other rules that the page offers, by name, as for `load_rule`; None: shipped ones.
+        alone: Whether an exported page shows it, which offers other rules by itself.
     """
 
     _generator: torch.Generator
@@ -78,13 +79,15 @@ class RuleWorld(LiveWorld):
         seed: int = 0,
         particle_count: int | None = None,
         choices: Mapping[str, str] | None = None,
+        alone: bool = False,
     ) -> None:
         super().__init__(seed)
-        self._device = device
+        self._device, self._alone = device, alone
         self._rules: dict[str, NPARule] = {}
         # Tasks with their targets, of which the slider of N makes many.
         self._trained = functools.lru_cache(8)(self._load_task)
-        others = {name: name for name in shipped_rules()} if choices is None else dict(choices)
+        shipped = {} if alone else {name: name for name in shipped_rules()}
+        others = shipped if choices is None else dict(choices)
         named = {path: name for name, path in (choices or {}).items()}
         name = named.get(source) or rule_name(source)
         self._choices = others | {name: source}
@@ -101,10 +104,9 @@ class RuleWorld(LiveWorld):
         rule = self._live_rule(name).rule
         # For a fast start: 3D targets of full size take many seconds to draw.
         small_views = {"resolution": 64, "training_views": 1, "held_out_views": 6}
-        options = small_views if rule.space_dim == 3 else {}
-        return task_of_rule(
-            self._choices[name], rule, self._device, particle_count=particle_count, **options
-        )
+        options: dict[str, Any] = small_views if rule.space_dim == 3 else {}
+        options |= {"particle_count": particle_count, "for_page": self._alone}
+        return task_of_rule(self._choices[name], rule, self._device, **options)
 
     def _choose_rule(self, name: Any, particle_count: int | None = None) -> None:
         """Take the rule `name` with the task that it was trained on, and start a new world."""
@@ -126,7 +128,7 @@ class RuleWorld(LiveWorld):
         self._generator = torch.Generator(self._device).manual_seed(self.seed)
         seed_world = self.task.seed(1, generator=self._generator, device=self._device)
         # The goal is the world's: it is no field of particles that come and go.
-        self.particles, self._goal = seed_world._replace(goal=None), seed_world.goal
+        self.particles, self.goal = seed_world._replace(goal=None), seed_world.goal
         self.count = self.particles.x.shape[1]
         """Particles of a newly seeded world."""
         self.live_rules = [replace(self.main, count=self.count, density_count=float(self.count))]
@@ -151,7 +153,7 @@ class RuleWorld(LiveWorld):
 
     def describe(self) -> WorldEvent:
         """Return the event "world", all its fields."""
-        frame, goal = self.task.frame, self._goal if self.task.classifies else None
+        frame, goal = self.task.frame, self.goal if self.task.classifies else None
         others = " of scikit-learn's digits" if self.trained.why_not_measurable else ""
         return super().describe() | {
             "title": self.main.name,
@@ -313,7 +315,7 @@ class RuleWorld(LiveWorld):
         comparable = self.trained.why_not_measurable is None and len(self.live_rules) == 1
         if not comparable or not self.counts[0] or start < self._loss_due:
             return None
-        loss = float(self.task.with_goal(self._goal).metric(*self.particles[:2]))
+        loss = float(self.task.with_goal(self.goal).metric(*self.particles[:2]))
         self._loss_due = start + (time.perf_counter() - start) / LOSS_FRACTION
         return loss
 

@@ -53,6 +53,7 @@ class Training:
         self._thread: threading.Thread | None = None
         self.report: TrainingEvent = {"type": "training", "state": "none", "limit": MAX_BYTES}
         """The event for pages; a new object after each change."""
+        self._learned: Any = None  # The report of the last run that left a rule.
 
     @property
     def active(self) -> bool:
@@ -137,14 +138,24 @@ class Training:
         if report != self.report:
             self.report = report
 
+    def _end(self, state: str, **fields: Any) -> None:
+        """Report the end of a run; one that leaves no rule gives way to the last one that did."""
+        if state == "stopped" and not self.report["has_rule"]:
+            fields["message"] = "Stopped before anything was learned."
+        report: Any = self.report | {"state": state} | fields
+        if report["has_rule"]:
+            self._learned = report
+        elif self._learned:
+            report = self._learned | {"refused": report["name"]} | fields
+        self.report = report
+
     def _run(self, stored: Path, whole: bool) -> None:
         try:
             self._read_and_learn(stored, whole)
         except Exception as error:
             message = str(error).replace(str(stored), self.report["name"])
-            if "keep_background" in message and not whole:
-                self._set(cure="whole")
-            self._set(state="failed", message=message)
+            cured = "keep_background" in message and not whole
+            self._end("failed", message=message, **({"cure": "whole"} if cured else {}))
         # Not by the report, which may already be that of the next run.
         if not RunFolder(stored.parent).rule.exists():
             shutil.rmtree(stored.parent, ignore_errors=True)
@@ -154,7 +165,7 @@ class Training:
         words = ["npa_envs.web.dropped_file", str(stored), *(["whole"] if whole else [])]
         output = self._call(words, folder, "reading the file", seconds=READ_SECONDS)
         if self._stopping.is_set():
-            return self._set(state="stopped")
+            return self._end("stopped")
         flat = (folder / PICTURE).exists()
         note = output.removeprefix(f"{stored.name}: ").strip()
         task = "morphogenesis2d" if flat else "morphogenesis3d"
@@ -180,7 +191,7 @@ class Training:
             "the training",
         )  # fmt: skip
         self._look(folder)
-        self._set(state="stopped" if self._stopping.is_set() else "done", seconds_left=0.0)
+        self._end("stopped" if self._stopping.is_set() else "done", seconds_left=0.0)
 
     def _call(
         self, words: list[str], folder: Path, what: str, *, seconds: float | None = None

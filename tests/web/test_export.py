@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import base64
+import io
 import json
 import re
 import subprocess
 import threading
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
+from PIL import Image
 from support.page_worlds import SPECIES, TOLERANCE, WORLDS, example, packed, unpacked
 from support.slow import slow
 from torch import Tensor
@@ -19,7 +23,8 @@ from npa_envs.errors import NPAError
 from npa_envs.rule.files import load_rule, save_rule
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.damage import DAMAGE_SIZES
-from npa_envs.tasks.point_classification import class_colours
+from npa_envs.tasks.point_classification import PALETTE, class_colours
+from npa_envs.tasks.targets.notes import left_out
 from npa_envs.web import export, messages
 from npa_envs.web.export import check_browser_rule, export_web, joined_modules, page_rule, page_text
 from npa_envs.web.live_world import ColouredWorld, Colouring
@@ -380,6 +385,30 @@ def test_a_page_is_one_small_file_that_asks_for_nothing(tmp_path):
     assert "<script>alert(1)" not in text
     assert "<b>" not in text
     assert '"name":"\\u003cb>"' in text
+
+
+def test_the_gallery_shows_another_clear_digit_of_each_rule_that_classifies(
+    tmp_path, monkeypatch, capsys, caplog
+):
+    pytest.importorskip("sklearn")
+    monkeypatch.chdir(tmp_path)  # Without MNIST.
+    left_out.cache_clear()
+    names = ("dots", "digits", "mnist")
+    words = ["export-web", *names, "--gallery", "--out", "page.html", "--particle-count"]
+    assert main([*words, "512"]) == 0
+    said = "mnist: its page shows scikit-learn's digits: its data set is not on this computer\n"
+    assert capsys.readouterr().err == said
+    text = (tmp_path / "page.html").read_text(encoding="utf-8")
+    tiles = re.findall(r'<li>.*base64,(.*?)" alt="">\s*<span>(\w+)(.*?)</span>', text)
+    assert [tile[1] for tile in tiles] == list(names)
+    assert ["classifies digits" in tile[2] for tile in tiles] == [False, True, True]
+    for digit, tile in zip((2, 3), tiles[1:], strict=True):
+        pixels = np.asarray(Image.open(io.BytesIO(base64.b64decode(tile[0]))).convert("RGBA"))
+        colour = pixels[pixels[..., 3] > 200][:, :3].mean(axis=0) / 255.0
+        assert np.abs(np.array(PALETTE) - colour).sum(axis=1).argmin() == digit
+    # Elsewhere one hears how to get the data.
+    RuleWorld("mnist", device=torch.device("cpu"), choices={})
+    assert "digits instead: MNIST is not in the folder 'data', and nothing is down" in caplog.text
 
 
 def test_an_import_or_export_of_another_form_is_refused(tmp_path, monkeypatch):

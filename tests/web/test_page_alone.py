@@ -174,7 +174,7 @@ def test_a_plot_of_the_loss_is_shown_where_there_is_one(run):
 
 
 def test_the_physics_is_put_back_as_trained_where_it_differs(run):
-    sent, disabled = run("""
+    sent, disabled, hints = run("""
         const setting = (value, trained) => ({ value, trained, low: 0.01, high: 99, scale: null });
         const settings = { speed: setting(4, 1), eps: setting(0.1, 0.1), count: setting(9, 9) };
         const event = { ...world, settings };
@@ -185,8 +185,13 @@ def test_the_physics_is_put_back_as_trained_where_it_differs(run):
         });
         sent.length = 0;
         element("trained").onclick();
-        return [ofType("set").map(({ name, value }) => [name, value]), states];
+        const hints = [{}, { seed: 1 }].map((fields) => {
+          listen({ ...event, ...fields });
+          return element("hint").textContent;
+        });
+        return [ofType("set").map(({ name, value }) => [name, value]), states, hints];
     """)
+    assert hints == ["Physics as trained. New grows a fresh world", BRUSHES["wipe"].label]
     assert disabled == [True, False]
     assert sent == [["eps", 0.1], ["count", 9]]
 

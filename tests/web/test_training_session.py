@@ -322,6 +322,24 @@ def test_a_learned_rule_stays_where_the_next_file_comes_at_once(tmp_path, monkey
     assert (tmp_path / run_id / "rule.safetensors").exists()
 
 
+@pytest.mark.parametrize("learned_before", [False, True])
+def test_stopped_before_there_is_a_rule_the_page_hears_that_nothing_was_learned(
+    tmp_path, monkeypatch, learned_before
+):
+    training = Training(tmp_path)
+    if learned_before:
+        training._set(id="x", name="a.png", has_rule=True)
+        training._end("done")
+    monkeypatch.setattr(Training, "_call", lambda self, *_, **__: self._stopping.wait(60) and "")
+    training.begin("b.obj", b"1")
+    training.stop()
+    report = ended(training)
+    assert report["message"] == "Stopped before anything was learned."
+    assert report["has_rule"] == learned_before
+    end = (report["state"], report["name"], report.get("refused"))
+    assert end == (("done", "a.png", "b.obj") if learned_before else ("stopped", "b.obj", None))
+
+
 # With processes.
 
 
@@ -344,6 +362,37 @@ def test_the_page_hears_in_words_what_the_child_refuses(tmp_path):
     assert str(tmp_path) not in report["message"]
     # Nothing is left of it.
     wait_until(lambda: list(tmp_path.iterdir()) == [])
+
+
+def test_what_is_refused_leaves_the_last_learned_rule_to_the_pages(tmp_path, monkeypatch):
+    def learn(self, stored, whole):
+        (stored.parent / "rule.safetensors").write_bytes(b"rule")
+        self._set(has_rule=True)
+        self._end("done")
+
+    training = Training(tmp_path)
+    _, client = client_of(training)
+    with monkeypatch.context() as patched:
+        patched.setattr(Training, "_read_and_learn", learn)
+        run_id = training.begin("a.png", b"1")
+        learned = ended(training)
+    for name, content, part in (
+        ("holiday.jpg", png(noise=True), "keep_background"), ("hello", b"hello", "one picture sym"),
+    ):  # fmt: skip
+        training.begin(name, content, emoji=name == "hello")
+        assert not training.report["has_rule"]
+        report = ended(training)
+        assert part in report["message"]
+        cure = {"cure": "whole"} if name == "holiday.jpg" else {}
+        added = {"refused": name, "message": report["message"]} | cure
+        assert report == learned | added
+        assert client.get(f"/training/{run_id}/rule.safetensors").content == b"rule"
+    with monkeypatch.context() as patched:
+        patched.setattr(Training, "_read_and_learn", learn)
+        training.begin("b.png", b"1")
+        report = ended(training)
+    assert (report["name"], report["state"]) == ("b.png", "done")
+    assert not {"refused", "message", "cure"} & set(report)
 
 
 @pytest.mark.slow
@@ -379,7 +428,8 @@ def test_a_dropped_picture_is_learned_and_offered(tmp_path):
     other = training.begin("b.png", png(opaque=True))
     assert training.file(run_id, "rule.safetensors") is None
     training.close()
-    assert training.report["state"] == "stopped"
+    assert training.report["refused"] == "b.png"
+    assert training.file(run_id, "rule.safetensors").exists()
     assert (tmp_path / run_id / "rule.safetensors").exists()
     assert other != run_id
 

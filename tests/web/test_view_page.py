@@ -272,6 +272,31 @@ def test_the_card_shows_the_estimated_time_until_it_is_measured(shown):
 
 
 @pytest.mark.slow
+def test_the_card_says_what_was_refused_below_the_rule_that_was_learned(shown):
+    page, _ = shown()
+    learned, cut, stopped = page.run("""(async () => {
+        const { TrainingCard } = await import("./training.js");
+        const card = new TrainingCard(() => {}), last = { name: "a.png", folder: "runs", id: "1" };
+        const done = { ...last, state: "done", seconds: 9, preset: "fast", has_rule: true };
+        card.open = true;
+        return [
+            { ...done, refused: "hello", message: "give one emoji" },
+            { ...done, refused: "b.png", message: "keep_background", cure: "whole" },
+            { ...last, state: "stopped", message: "Nothing was learned.", has_rule: false },
+        ].map((event) => {
+            card.listen({ type: "training", ...event });
+            return card.card.innerText.split("\\n");
+        });
+    })()""")
+    for lines in (learned, cut):
+        assert {"Your a.png", "Save rule", "Save page", "Watch"} <= set(lines)
+    assert "give one emoji" in learned
+    assert cut[-1].startswith("b.png is opaque")
+    assert "Nothing was learned." in stopped
+    assert "Choose a file" in stopped
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("painter", ["canvas", "webgl2"])
 def test_a_3d_world_turns_under_the_pointer(shown, painter, tmp_path):
     page, _ = shown("duck", 1024, query=f"?painter={painter}")

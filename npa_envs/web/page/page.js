@@ -141,6 +141,7 @@ class Page {
     if (another || before.seed !== world.seed) {
       this.tracers.clear();
       this.acted = null;
+      this.brushes.note = "";
       Object.values(this.plots).forEach((plot) => plot.clear());
     }
     this.described = true;
@@ -459,6 +460,7 @@ class Controls {
     $("reset").onclick = () => page.send({ type: "reset" });
     $("trained").onclick = () => {
       for (const [name, { trained: value }] of changed(page.world)) page.send({ type: "set", name, value });
+      page.brushes.showHint((page.brushes.note = "Physics as trained. New grows a fresh world"));
     };
     $("fold").onclick = () => this.fold(!$("panel").hidden);
     for (const one of [$("rule"), $("choice")])

@@ -115,12 +115,12 @@ export class TrainingCard {
 
   // What went wrong last, for the user.
   get problem() {
-    const { refusal, event: { name, state, cure, message } } = this;
+    const { refusal, event: { name, state, cure, message, refused = name } } = this;
     // What was being learned may have ended since.
     if (refusal && (!this.busy || ACTIVE.includes(state))) return refusal;
-    if (cure === "whole") return `${name} is opaque and its border has many colours, so there is no part to cut out: ` +
+    if (cure === "whole") return `${refused} is opaque and its border has many colours, so there is no part to cut out: ` +
       "give a picture with a transparent background, or grow all of it";
-    return state === "failed" ? message : "";
+    return message ?? "";
   }
 
   closed() {
