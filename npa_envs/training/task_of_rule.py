@@ -55,7 +55,7 @@ def task_of_rule(
         rule: The rule.
         device: Device of the task's target.
         particle_count: Particles N; None: as trained.
-        for_page: Whether an exported page runs it, whose user need not hear how to get the data.
+        for_page: Whether an exported page runs it; missing data are then named without a cure.
         fields: Fields of the task's configuration to change; None: unchanged.
 
     Raises:
