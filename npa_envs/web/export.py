@@ -302,7 +302,7 @@ Wipe a part and watch.</p>
 
 
 def _gallery(title: str, previews: Mapping[str, str], rules: Sequence[Mapping[str, Any]]) -> str:
-    captions = {r["name"]: " <small>classifies digits</small>" for r in rules if r["classes"]}
+    captions = {r["name"]: "<br><small>classifies digits</small>" for r in rules if r["classes"]}
     links = "\n".join(
         f'<li><a href="#{quote(name, safe="")}"><img src="{picture}" alt="">'
         f"<span>{html.escape(name)}{captions.get(name, '')}</span></a></li>"
