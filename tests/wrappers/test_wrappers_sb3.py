@@ -64,7 +64,7 @@ def test_rows_are_those_of_the_worlds_in_order(adapter, reward, output):
         final = np.stack(vector_infos["final_obs"]).reshape(-1, *shapes[0])
         for row in (0, each - 1, each, 2 * each - 1):
             np.testing.assert_array_equal(infos[row].pop("terminal_observation"), final[row])
-            # Worlds that cannot succeed do not say that they failed.
+            # These worlds have no success.
             assert infos[row] == {"TimeLimit.truncated": True}
             infos[row]["terminal_observation"] = final[row]
     # No later step writes to the environment's buffers through them.
@@ -125,7 +125,7 @@ def test_success_is_no_time_limit(adapter):
 
 
 @pytest.mark.parametrize("keywords", [{}, {"success_loss": 0.0}])
-def test_synchronous_worlds_tell_of_success_only_if_there_is_one(keywords):
+def test_synchronous_worlds_have_is_success_only_where_success_is_possible(keywords):
     single = functools.partial(
         gym.make, "npa/Morphogenesis2D-v0", particle_count=16, max_episode_steps=1, **keywords
     )
