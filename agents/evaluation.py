@@ -58,22 +58,28 @@ def evaluate_policy(env: Any, policy: Callable[[Any], Any], seeds: Iterable[int]
         env: A single or a vector environment of `npa_envs`, or Gymnasium's `SyncVectorEnv` or
             `AsyncVectorEnv` of single ones, with or without wrappers, in any autoreset mode, with
             `max_episode_steps`.
-        policy: Maps observations, [B, N, P], to actions, [B, N, A]; B is 1 where `env` is single.
+        policy: Maps observations, [B, N, P], to actions, [B, N, A]; B is 1 where `env` is single,
+            which also takes actions [N, A].
             A policy that reads the worlds instead has `made_for(env)`, which returns the policy
             for an environment.
         seeds: Seed of each episode, integers of at least 0.
 
     Raises:
-        NPAError: Seeds are missing or wrong, or the environment is not of this library.
+        NPAError: Seeds are missing or wrong, or the environment is not of this library, or has
+            several agents.
     """
+    # The worlds of several species that learners step as one agent have `episode_steps`.
+    if hasattr(env, "possible_agents") and not hasattr(env, "episode_steps"):
+        raise NPAError(
+            f"env must have one agent, got {type(env).__name__} with {len(env.possible_agents)}: "
+            "for returns by agent, reset(seed=...) and add up rewards[agent] until terminations"
+            "[agent] | truncations[agent]; for the mean of all species, give "
+            "Problem(env_id='npa/MixingSmall-v0', episode_steps=32).make_envs() of "
+            "npa_envs.agents.learning"
+        )
     # `_run_many` checks environments in other processes by their infos.
     in_processes = isinstance(getattr(env, "unwrapped", None), AsyncVectorEnv)
     worlds = None if in_processes else unwrapped(env).worlds
-    if not (hasattr(env, "num_envs") or isinstance(env, gymnasium.Env)):
-        raise NPAError(
-            f"env must be a single or a vector environment, got {type(env).__name__}: for several "
-            "species use Problem(...).make_envs() of npa_envs.agents.learning"
-        )
     limits = [getattr(holder, "episode_steps", None) for holder in (worlds, env)]
     if limits == [None, None] and _step_limit(env) is None:
         raise NPAError("env must end its episodes: make it with max_episode_steps=256")
@@ -158,7 +164,9 @@ def _run_single(
             if isinstance(observation, Mapping)
             else observation[None]
         )
-        action = policy(batch)[0]
+        action = policy(batch)
+        if np.ndim(action) > len(env.action_space.shape or ()):
+            action = action[0]
         observation, reward, terminated, truncated, info = env.step(action)
         total, steps, over = total + float(reward), steps + 1, terminated or truncated
     end_reason = np.array([_end_reason(info, terminated)], dtype=object)

@@ -104,9 +104,10 @@ def load_policy(source: str, env: Any) -> Callable[[Any], Any]:
     Raises:
         NPAError: There is no such policy, its file is damaged, or it does not fit `env`.
     """
-    worlds, task = unwrapped(env).worlds, unwrapped(env).task
-    shipped, id = shipped_policies(), getattr(env.spec, "id", None)
-    by_particle = task.controls not in ("brushes", "codes") and task.config.control != "central"
+    worlds, task = unwrapped(env).worlds, unwrapped(env).worlds.task
+    shipped, id = shipped_policies(), getattr(getattr(env, "spec", None), "id", None)
+    is_central = getattr(task.config, "control", None) == "central"
+    by_particle = task.controls not in ("brushes", "codes") and not is_central
     special = {"scripted": isinstance(task, GardenTask), "shipped": id in shipped}
     known = ["zero", "random", *(name for name, is_there in special.items() if is_there)]
     is_word = isinstance(source, str) and source == Path(source).stem and not Path(source).exists()

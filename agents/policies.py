@@ -24,7 +24,8 @@ Array = TypeVar("Array", NDArray[Any], Tensor)
 
 def unwrapped(env: Any) -> Any:
     """Return the environment of `npa_envs` inside wrappers; of a `SyncVectorEnv` its first one."""
-    inner = getattr(env, "unwrapped", None)
+    # Batches of agents have no wrappers.
+    inner = getattr(env, "unwrapped", env)
     if isinstance(inner, SyncVectorEnv):
         inner = inner.envs[0].unwrapped
     if not hasattr(inner, "worlds"):
@@ -59,7 +60,7 @@ def acting_interface(env: Any) -> Interface:
     if space is not None and not callable(space) and (shape is None or len(shape) != 2):
         raise NPAError(
             f"this policy acts by rows of particles, but the environment takes {space}: use "
-            "env.action_space.sample(), or give another environment"
+            "load_policy('random', env) or load_policy('zero', env) of npa_envs.agents"
         )
     return interface
 
@@ -186,7 +187,8 @@ class RulePolicy(Policy):
         state_scale = checked_positive("state_scale", state_scale)
         if env is not None:
             changed, original = (
-                getattr(e, "single_observation_space", None) or e.observation_space
+                getattr(e, "single_observation_space", None)
+                or getattr(e, "observation_space", None)
                 for e in (env, unwrapped(env))
             )
             if changed != original:
@@ -269,7 +271,7 @@ class SpreadPolicy(Policy):
 
 def target_colour(env: Any) -> Tensor | None:
     """Return the mean colour of an environment's target, shape [3]; None where it has no target."""
-    target = getattr(getattr(unwrapped(env).task, "task", None), "target", None)
+    target = getattr(getattr(unwrapped(env).worlds.task, "task", None), "target", None)
     return None if target is None else target.mean_colour
 
 

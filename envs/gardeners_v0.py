@@ -6,10 +6,13 @@ Importing this module registers `npa/Gardeners-v0` with PettingZoo (1.27 or newe
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import cached_property
 from typing import Any, ClassVar
 
 import numpy as np
 import torch
+from gymnasium import Space
+from gymnasium.vector.utils import batch_space
 from torch import Tensor
 
 from npa_envs.envs.core.base import to_output
@@ -165,10 +168,11 @@ class GardenersVectorEnv(NPAVectorEnv):
     """B worlds of `GardenersEnv`, stepped together, by an `NPAVectorEnv` with two agents.
 
     World k, reset with `seed`, is that with `seed + k` by itself. Each agent has observations
-    [B, O], actions [B, J W], rewards and flags [B], and the infos of `npa/Gardener2D-v0`. Its other
-    attributes are those of `MultiSpeciesVectorEnv`.
+    [B, O], actions [B, J W], rewards and flags [B], and the infos of `npa/Gardener2D-v0`, with
+    `live`, `acted` and `reason` as of `MultiSpeciesVectorEnv`, whose other attributes it has.
     """
 
+    metadata = NPAVectorEnv.metadata | {"name": "gardeners_v0", "is_parallelizable": True}
     task_type = _SharedTask
 
     def __init__(self, max_cycles: int = 32, *, world_count: int = 1, **config: Any) -> None:
@@ -183,23 +187,36 @@ class GardenersVectorEnv(NPAVectorEnv):
         self.action_spaces = dict.fromkeys(AGENTS, self.action_space)
         self.single_state_space = state_space(self.worlds.physics, self.worlds.x.shape[1])
 
-    def reset(self, **options: Any) -> tuple[Any, dict[str, Any]]:
+    @cached_property
+    def state_space(self) -> Space[Any]:
+        """Space of all worlds' `state`, [B, N, 2 + C + 1]; large, so made at the first use."""
+        return batch_space(self.single_state_space, self.world_count)
+
+    def reset(self, seed: Any = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
         """Start episodes as `NPAVectorEnv.reset` does; return both agents' observations, infos."""
-        observation, infos = super().reset(**options)
-        return _for_both(observation), {agent: dict(infos) for agent in AGENTS}
+        observation, infos = super().reset(seed=seed, options=options)
+        return _for_both(observation), self._by_agent(infos)
 
     def step(self, actions: Mapping[str, Any]) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
         """Apply both agents' actions; return what PettingZoo's `step` does, of all worlds."""
         if not isinstance(actions, Mapping) or set(actions) != set(AGENTS):
             raise NPAError(f"actions must be given for the agents {AGENTS}, got {shown(actions)}")
+        acted = self._mask(~self._ended)
         observation, reward, *ends, infos = super().step(actions)
         ended, cut = (dict.fromkeys(AGENTS, end) for end in ends)
         rewards = {AGENTS[0]: reward, AGENTS[1]: -reward}
-        return _for_both(observation), rewards, ended, cut, {a: dict(infos) for a in AGENTS}
+        # A restart has moved the reasons of the episodes that ended.
+        last = infos.get("final_info", infos)
+        infos |= {"acted": acted} | {n: last[n] for n in ("reason",) if n in last}
+        return _for_both(observation), rewards, ended, cut, self._by_agent(infos)
 
     def state(self) -> Any:
         """Return the worlds as `GardenersEnv.state` does, [B, N, 2 + C + 1]."""
         return _state(self)
+
+    def _by_agent(self, infos: dict[str, Any]) -> dict[str, Any]:
+        live = self._mask(~self._ended)
+        return {agent: infos | {"live": live} for agent in AGENTS}
 
 
 def _state(garden: Any) -> Any:

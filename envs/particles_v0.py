@@ -114,6 +114,7 @@ class ParticlesVectorEnv(MultiSpeciesVectorEnv):
     Observations of an agent have shape [B, P], actions [B, A], rewards and flags [B].
     """
 
+    metadata = ParticlesEnv.metadata
     _of_particles = True
 
 

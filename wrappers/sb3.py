@@ -225,7 +225,11 @@ class _EpisodeRows(RowVecEnv):
             return [self.shared_info] * self.num_envs
         count, final = self.row_count, infos["final_info"]
         entries: dict[str, Any] = {}
-        success = final.get("is_success", final.get("success"))
+        inner = self.vector_env.unwrapped
+        # The first one of a `SyncVectorEnv`; those in other processes cannot be asked.
+        batch = getattr(getattr(inner, "envs", [inner])[0].unwrapped, "worlds", None)
+        can_succeed = batch is None or batch.episodes.can_succeed
+        success = final.get("is_success", final.get("success") if can_succeed else None)
         if success is not None:
             entries["is_success"] = on_host(success)[0][worlds].repeat(count).tolist()
         if self.bootstrap:
@@ -257,8 +261,8 @@ class ParticleVecEnv(_EpisodeRows):
     to the CPU once (on CUDA make the environment with `output="torch"`: the copy is then pinned).
 
     Rows of a finished world have their own infos, with `terminal_observation`,
-    `TimeLimit.truncated` and `is_success`; the others share a read-only empty one. Attributes and
-    methods are those of the whole environment, the same for each row.
+    `TimeLimit.truncated` and, if episodes can succeed, `is_success`; the others share a read-only
+    empty one. Attributes and methods are those of the whole environment, the same for each row.
 
     Stable-Baselines3 counts rows: 8 worlds of 1024 particles are 8192 steps at once. Its defaults
     are made for a few rows; with PPO set for example `n_steps=32, batch_size=4096`.

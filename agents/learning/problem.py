@@ -380,7 +380,7 @@ class ConcatenatedSpeciesEnv(MultiSpeciesVectorEnv):
 
     def __init__(self, task: str, **config: Any) -> None:
         super().__init__(task, **config)
-        self.num_envs, self.episode_steps = self.world_count, self.max_cycles
+        self.episode_steps = self.max_cycles
         self.task, physics = self.worlds.task, self.worlds.physics
         self.metadata = self.metadata | {"autoreset_mode": AutoresetMode.SAME_STEP}
         counts, interface = self.config.agent_particle_counts, self.config.interface(physics)

@@ -127,6 +127,8 @@ class WorldEpisodes:
         """Names of the terms of the loss, known once worlds have been placed."""
         self.report = StepReport.empty(len(diverged), 0, diverged.device)
         """What a step returns apart from the observation."""
+        self.can_succeed = False
+        """Whether any episode so far had a loss at which it succeeds."""
         self._attach()
 
     def __getstate__(self) -> dict[str, Any]:
@@ -170,6 +172,7 @@ class WorldEpisodes:
         """Begin episodes of worlds, int64 [B'], to succeed at `success_loss`, [B']; None: never."""
         self.elapsed.index_fill_(0, world_indices, 0)
         self._start_loss[world_indices] = self.report.named.loss[world_indices]
+        self.can_succeed |= success_loss is not None
         if success_loss is None:
             self._success_loss.index_fill_(0, world_indices, -torch.inf)
         else:

@@ -72,8 +72,8 @@ class MultiSpeciesVectorEnv(AgentsEnv):
         autoreset_mode: str | AutoresetMode = "same-step",
         **config: Any,
     ) -> None:
-        self.world_count = checked_count("world_count", world_count)
-        """Worlds B."""
+        self.num_envs = self.world_count = checked_count("world_count", world_count)
+        """Worlds B; `num_envs` is the same number."""
         self.autoreset_mode = checked_mode(autoreset_mode)
         if self.autoreset_mode is AutoresetMode.NEXT_STEP:
             raise NPAError(
@@ -97,6 +97,11 @@ class MultiSpeciesVectorEnv(AgentsEnv):
     def action_spaces(self) -> dict[str, Space[Any]]:
         """Spaces of all worlds' actions, [B, N_k, A]; large, so made at the first use."""
         return self._batched(self.single_action_spaces)
+
+    @cached_property
+    def state_space(self) -> Space[Any]:
+        """Space of all worlds' `state`, [B, N, 2 + C + 1]; large, so made at the first use."""
+        return batch_space(self.single_state_space, self.world_count)
 
     def _batched(self, spaces: dict[str, Box]) -> dict[str, Space[Any]]:
         return {agent: batch_space(space, self.world_count) for agent, space in spaces.items()}

@@ -1,6 +1,7 @@
 """Policies: a rule's episodes are its rollouts, and what the scripted ones do and achieve."""
 
 import functools
+import re
 
 import gymnasium
 import numpy as np
@@ -20,7 +21,10 @@ from npa_envs.agents import (
     ZeroPolicy,
     evaluate_policy,
     interface_of,
+    load_policy,
 )
+from npa_envs.agents.learning import Problem
+from npa_envs.envs import gardeners_v0, multispecies_v0, particles_v0
 from npa_envs.errors import NPAError
 from npa_envs.rule.rule import COLOUR_OFFSET
 
@@ -272,6 +276,44 @@ def test_episodes_are_the_same_in_every_form_of_an_environment(form, expected):
         near = 1e-5 if "world" in form else 1e-6
         np.testing.assert_allclose(getattr(found, name), getattr(expected, name), atol=near)
     np.testing.assert_allclose(found.returns, found.start_losses - found.final_losses, atol=1e-5)
+
+
+def test_policies_of_a_single_world_may_answer_with_or_without_its_dimension():
+    env = make(particle_count=9, max_episode_steps=2)
+    zeros = np.zeros((9, env.action_space.shape[1]), np.float32)
+    bare, batched = (evaluate_policy(env, lambda _, z=z: z, [3]) for z in (zeros, zeros[None]))
+    assert bare.returns.tolist() == batched.returns.tolist()
+    refused(r"\[N, A\] = \(9, 18\), got \(8, 18\)", evaluate_policy, env, lambda _: zeros[:8], [3])
+
+
+@pytest.mark.parametrize("module", [multispecies_v0, particles_v0])
+def test_policies_act_in_batches_of_agents(module, gecko):
+    envs = module.batched("segregation", world_count=2, particle_count=8, state_dim=4)
+    observations, _ = envs.reset(seed=0)
+    for policy in (RandomPolicy(envs), load_policy("random", envs)):
+        actions = policy(observations)
+        assert all(envs.action_spaces[agent].contains(actions[agent]) for agent in envs.agents)
+        assert len({a.tobytes() for a in actions.values()}) == len(envs.agents)
+        envs.step(actions)
+    assert not any(a.any() for a in load_policy("zero", envs)(observations).values())
+    refused("rule must have the environment's state_dim, 4", RulePolicy, gecko, envs)
+
+
+@pytest.mark.parametrize("module", [multispecies_v0, particles_v0, gardeners_v0])
+def test_evaluation_takes_one_agent_and_names_what_it_takes(module):
+    small, named = {"particle_count": 16}, "Problem(env_id='npa/MixingSmall-v0', episode_steps=32)"
+    for env in (module.batched(world_count=2, **small), module.parallel_env(**small)):
+        wanted = f"one agent, got {type(env).__name__} with {len(env.possible_agents)}: .*"
+        refused(wanted + re.escape(named), evaluate_policy, env, abs, [0])
+    envs = eval(named, {"Problem": Problem}).make_envs(1)
+    assert evaluate_policy(envs, ZeroPolicy(envs), [0]).endings == ("time limit",)
+
+
+def test_policies_of_particles_name_those_of_other_actions():
+    env = gymnasium.make("npa/Shapeshifter2D-v0", particle_count=16)
+    for word, policy in {"random": RandomPolicy, "zero": ZeroPolicy}.items():
+        refused(rf"use .*load_policy\('{word}', env\)", policy, env)
+        assert env.action_space.contains(load_policy(word, env)(env.observation_space.sample()))
 
 
 def test_the_error_about_foreign_environments_says_how_to_make_ours():

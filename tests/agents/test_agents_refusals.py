@@ -129,7 +129,7 @@ REFUSED = {
         ({"seeds": []}, "seeds must have at least one seed"),
         ({"seeds": 7}, r"one for each episode, got 7: give seeds=range\(8\)"),
         ({"seeds": [0, 1, -1]}, "a seed must be an integer of at least 0, got -1"),
-        ({"make": multispecies_v0.parallel_env}, r"single or a vector .*make_envs"),
+        ({"make": multispecies_v0.parallel_env}, r"one agent, got .*make_envs"),
         ({"make": make, "max_episode_steps": -1}, "max_episode_steps=256"),
         ({"max_episode_steps": None}, "max_episode_steps=256"),
     ],

@@ -177,15 +177,43 @@ def test_worlds_of_particles_or_gardeners_equal_single_ones(module, keywords):
 )
 def test_batches_of_all_kinds_of_agents_have_the_same_attributes(module, keywords):
     envs = module.batched(world_count=2, **keywords)
-    assert (envs.world_count, envs.max_cycles) == (2, 3)
-    observations, _ = envs.reset(seed=0)
-    for _ in range(4):
+    assert (envs.world_count, envs.num_envs, envs.max_cycles) == (2, 2, 3)
+    assert envs.metadata["name"] == module.parallel_env(**keywords).metadata["name"]
+    observations, infos = envs.reset(0)
+    assert all(infos[agent]["live"].all() for agent in envs.agents)
+    for step in range(4):
         for agent, seen in observations.items():
             assert envs.observation_spaces[agent].contains(seen)
             assert envs.single_observation_spaces[agent].contains(seen[1])
         assert envs.single_state_space.contains(envs.state()[0])
+        assert envs.state_space.contains(envs.state())
         actions = {agent: envs.action_spaces[agent].sample() for agent in envs.agents}
-        observations, *_ = envs.step(actions)
+        observations, *_, infos = envs.step(actions)
+        for agent in envs.agents:
+            assert infos[agent]["acted"].tolist() == infos[agent]["live"].tolist() == [True, True]
+            assert list(infos[agent].get("reason", ())) == ["time limit"] * (2 * (step == 2))
+
+
+@pytest.mark.parametrize("output", ["numpy", "torch"])
+def test_gardeners_say_in_which_worlds_they_act(output):
+    for mode in ("next-step", "disabled"):
+        envs = gardeners_v0.batched(world_count=2, autoreset_mode=mode, output=output, **GARDEN)
+        _, infos = envs.reset(seed=0)
+        seen = []
+        for step in range(4):
+            if step == 3 and mode == "disabled":
+                _, infos = envs.reset(options={"reset_mask": np.array([True, False])})
+                assert infos["raider_0"]["live"].tolist() == [True, False]
+                break
+            actions = {
+                a: np.zeros((2, *s.shape), "f4") for a, s in envs.single_action_spaces.items()
+            }
+            *_, infos = envs.step(actions)
+            own = infos["raider_0"]
+            seen.append((own["acted"].tolist(), own["live"].tolist(), "reason" in own))
+        yes, no = [True, True], [False, False]
+        last = [(no, yes, False)] * (mode == "next-step")
+        assert seen == [(yes, yes, False), (yes, yes, False), (yes, no, True), *last]
 
 
 def test_ids_of_particles_are_the_worlds_of_the_ids_of_species():

@@ -1,5 +1,7 @@
 """Rows of Stable-Baselines3: particles, worlds and particles of species; SuperSuit's as well."""
 
+import functools
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -62,7 +64,8 @@ def test_rows_are_those_of_the_worlds_in_order(adapter, reward, output):
         final = np.stack(vector_infos["final_obs"]).reshape(-1, *shapes[0])
         for row in (0, each - 1, each, 2 * each - 1):
             np.testing.assert_array_equal(infos[row].pop("terminal_observation"), final[row])
-            assert infos[row] == {"TimeLimit.truncated": True, "is_success": False}
+            # These worlds have no success.
+            assert infos[row] == {"TimeLimit.truncated": True}
             infos[row]["terminal_observation"] = final[row]
     # No later step writes to the environment's buffers through them.
     assert_same(results, copies)
@@ -106,8 +109,9 @@ def test_living_worlds_are_rows_too_and_their_dictionaries_are_kept(name, output
         for k in np.flatnonzero(done):
             assert infos[k]["TimeLimit.truncated"] is True
             assert_same(infos[k]["terminal_observation"], vector_infos["final_obs"][k])
-            final = vector_infos["final_info"]
-            assert infos[k]["is_success"] == final.get("is_success", final["success"])[k]
+            # A shepherd says whether it succeeded; a gardener has no success.
+            final = vector_infos["final_info"].get("is_success", [None] * 3)
+            assert infos[k].get("is_success") == final[k]
 
 
 @pytest.mark.parametrize("adapter", [ParticleVecEnv, WorldVecEnv])
@@ -120,8 +124,19 @@ def test_success_is_no_time_limit(adapter):
     assert infos[1] == {"is_success": True, "TimeLimit.truncated": False}
 
 
+@pytest.mark.parametrize("keywords", [{}, {"success_loss": 0.0}])
+def test_synchronous_worlds_have_is_success_only_where_success_is_possible(keywords):
+    single = functools.partial(
+        gym.make, "npa/Morphogenesis2D-v0", particle_count=16, max_episode_steps=1, **keywords
+    )
+    rows = WorldVecEnv(gym.vector.SyncVectorEnv([single] * 2, autoreset_mode="SameStep"))
+    rows.reset()
+    *_, infos = rows.step(np.zeros((2, *rows.action_space.shape), np.float32))
+    assert [info.get("is_success", "none") for info in infos] == [not keywords and "none"] * 2
+
+
 def test_without_bootstrapping_an_end_is_an_end():
-    rows = ParticleVecEnv(batched(max_episode_steps=1), bootstrap=False)
+    rows = ParticleVecEnv(batched(max_episode_steps=1, success_loss=0.0), bootstrap=False)
     _, _, done, infos = rows.step(policy(rows.reset()))
     assert done.all()
     assert infos == [{"is_success": False}] * 128
