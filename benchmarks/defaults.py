@@ -5,7 +5,8 @@ python benchmarks/defaults.py npa/Gardener2DSmall-v0 SAC 0 250 ent_coef=auto_0.0
 
 It prints a line of JSON. Learners are PPO and SAC of Stable-Baselines3, a clone's file
 cleanrl/ppo_continuous_action.py of github.com/vwxyzjn/cleanrl, which runs as it is, and the
-policies to compare with: zero, random, scripted.
+policies to compare with: zero, random, scripted. Where particles act, the script is the best of
+some, by other worlds; where one controller acts for them, it acts by particles.
 """
 
 import contextlib
@@ -21,6 +22,7 @@ import stable_baselines3 as sb3
 import torch
 
 from npa_envs.agents import load_policy
+from npa_envs.agents.learning import Budget, Problem, train
 from npa_envs.envs import particles_v0
 
 torch.set_num_threads(1)  # enough for small worlds
@@ -118,9 +120,21 @@ def acting():
     return lambda _: draw.uniform(-limit, limit, shape).astype(np.float32)
 
 
+def scripted():
+    """Return the environment that a script acts in, and the script."""
+    env = make()
+    if ID[4:7] in ("Gar", "She"):
+        return env, load_policy("scripted", env)
+    given = {} if AGENTS else {"control": "particles"}
+    length = env.max_cycles if AGENTS else env.spec.max_episode_steps
+    problem = Problem(env_id=particles_v0.SMALL.get(ID, ID), keywords=given, episode_steps=length)
+    best = train("scripted", problem, Budget(seconds=SECONDS), SEED).policy
+    return (env if AGENTS else gym.make(ID, **given)), best
+
+
 test, steps = make(), 0
 if LEARNER == "scripted":
-    policy = load_policy("scripted", test)
+    test, policy = scripted()
 elif LEARNER in ("zero", "random"):
     policy = acting()
 else:

@@ -14,11 +14,13 @@ from __future__ import annotations
 
 import importlib
 import inspect
+import json
 import re
 import sys
 import typing
 from dataclasses import MISSING, fields
 from pathlib import Path
+from statistics import mean
 
 import gardeners_page
 import species_pages
@@ -77,6 +79,7 @@ ONCE = {
 }
 """Sections whose common part is on the first page alone, and what the others have instead."""
 
+MEASURED = "[measured](../training.md#defaults-that-learn)"
 COLUMNS = re.compile(r"\| `([^`]+) : ([^`]+)` \|")
 
 
@@ -247,15 +250,33 @@ def page(registration: Registration) -> str:
 
 
 def learned_by(registration: Registration) -> list[tuple[str, str]]:
-    """Return the row of an environment's first table that says how learners take it, or none."""
-    task = environment_class(registration).task_type
+    """Return the row of an environment's first table that says what learns it, or takes it."""
+    task, name = environment_class(registration).task_type, registration.name
+    if registration in CODED:
+        return [("Learned by", '[PPO](#description), with `actions="choice"`')]
     if task.worlds_type is RuleDrivenWorlds:
-        return []
+        return [("Learned by", f"[PPO](../gardening.md): {garden_returns(name)} ({MEASURED})")]
     if "control" in task.config_type.fixed:
-        return [("Learned by", "`ParticleVecEnv`")]
-    central = (f", `{row.id}`" for row in CENTRAL if row.name == registration.name)
-    taken = '`ParticleVecEnv`; without it: `control="central"`'
-    return [("Learned by", taken + "".join(central))]
+        return [("Taken by", "`ParticleVecEnv`; nothing measured")]
+    central = [f"`{row.id}`" for row in CENTRAL if row.name == name]
+    if not central:
+        learned = "[some methods](../npa_bench.md#results)"
+        return [("Learned by", f'{learned}; `ParticleVecEnv` and `control="central"` take it')]
+    ending = " ([tutorial](../tutorial.md))" if registration is FIRST else " takes it"
+    learned = f'`control="central"`, {central[0]} ({MEASURED}); `ParticleVecEnv`{ending}'
+    return [("Learned by", learned)]
+
+
+def garden_returns(name: str) -> str:
+    """Return what PPO and the script earn in a small garden, by the record of defaults."""
+    id = f"npa/{name}Small-v0"
+    record = gardeners_page.RESULTS / "defaults_cpu.json"
+    runs = [run for run in json.loads(record.read_text("utf-8"))["runs"] if run["id"] == id]
+    learned, script = (
+        mean(mean(run["return"]) for run in runs if (run["learner"], run.get("seconds")) == kind)
+        for kind in (("PPO", 900), ("scripted", None))
+    )
+    return f"return {learned:.1f} of `{id}` in 900 s; script: {script:.1f}"
 
 
 def size_table() -> str:
@@ -282,16 +303,19 @@ def index() -> str:
         text = sections(environment_class(registration))[""]
         rows.append((f"[`{registration.id}`]({registration.name}.md)", text))
     opening = (
-        "One page each: observation, action, reward, episodes, arguments. `import npa_envs` "
+        "One page each. `import npa_envs` "
         'registers the ids; `gym.make("npa_envs:npa/Texture-v0")` does so by itself. Words and '
         "letters are "
         "explained in [the glossary](../glossary.md). To train a first policy: "
-        "[the tutorial](../tutorial.md). To make one of your own: "
-        "[your own task as an environment](../own_environment.md)."
+        "[the tutorial](../tutorial.md). [To make one of your own](../own_environment.md)."
     )
     rows += [gardeners_page.index_row(), *species_pages.index_rows()]
     listing = table(("Environment", "Task"), rows)
-    parts = (species_pages.MADE, "# Environments", opening, listing, size_table())
+    others = (
+        "PettingZoo's ids, listed on their modules' pages, need the module: `import "
+        'npa_envs.envs.multispecies_v0`, then `pettingzoo.make("parallel", "npa/MixingSmall-v0")`.'
+    )
+    parts = (species_pages.MADE, "# Environments", opening, listing, size_table(), others)
     return "\n\n".join(parts) + "\n"
 
 

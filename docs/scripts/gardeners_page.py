@@ -8,6 +8,8 @@ environment changes.
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
 from draw_environment_pictures import FILM_SIZE, PICTURE_SIZE, film_steps
 from films import FPS, IMAGES, Frame
@@ -19,6 +21,7 @@ from npa_envs.render import write_filmstrip, write_webp
 
 NAME = "Gardeners"
 IMAGE = IMAGES / "env_gardeners_strip.webp"
+RESULTS = IMAGES.parents[1] / "benchmarks" / "results"
 FILM = IMAGES / "env_gardeners.webp"
 STEPS = (0, 4, 8, 16, 24, 32)
 CAPTION = (
@@ -54,6 +57,7 @@ def page() -> str:
             ("Action space", f"`{env.action_space(first)}`"),
             ("Steps of an episode", str(env.max_cycles)),
             ("Functions", "`parallel_env`, `env`, `raw_env`, `batched`"),
+            ("Learned by", f"[MAPPO](../recipes_rl.md#many-agents): {keeper_returns()}"),
         ],
     )
     made = NOTE.format(script="build_environment_pages.py", source="docstrings")
@@ -61,6 +65,13 @@ def page() -> str:
     opening = ("# npa_envs.envs.gardeners_v0", text.pop(""), shown, facts, EXAMPLE)
     body = [f"## {heading}\n\n{content}" for heading, content in text.items()]
     return "\n\n".join((made, *opening, *body)) + "\n"
+
+
+def keeper_returns() -> str:
+    """Return what the keeper earns, learned and idle, by the record of the programs."""
+    record = json.loads((RESULTS / "examples_cpu.json").read_text(encoding="utf-8"))
+    (run,) = (run for run in record["runs"] if run["name"] == "mappo_gardeners")
+    return f"the keeper's return {run['learned'][0]:.1f}, without action {run['zero'][0]:.1f}"
 
 
 def index_row() -> tuple[str, str]:
