@@ -227,8 +227,9 @@ class _EpisodeRows(RowVecEnv):
         entries: dict[str, Any] = {}
         inner = self.vector_env.unwrapped
         # The first one of a `SyncVectorEnv`; those in other processes cannot be asked.
-        batch = getattr(getattr(inner, "envs", [inner])[0].unwrapped, "worlds", None)
-        can_succeed = batch is None or batch.episodes.can_succeed
+        worlds_of = getattr(getattr(inner, "envs", [inner])[0].unwrapped, "worlds", None)
+        episodes = getattr(worlds_of, "episodes", None)
+        can_succeed = episodes is None or episodes.can_succeed
         success = final.get("is_success", final.get("success") if can_succeed else None)
         if success is not None:
             entries["is_success"] = on_host(success)[0][worlds].repeat(count).tolist()

@@ -150,7 +150,7 @@ BUDGETS = {
     "places that draw masks": Budget(places_that_draw_masks, 1, 1),
     "options of npa-envs train": Budget(options_of_train, 76, 76),
     "source files": Budget(lambda: len(files(*PACKAGES, suffixes=SOURCES)), 283, 277),
-    "source lines": Budget(lambda: lines(files(*PACKAGES, suffixes=SOURCES)), 67_589, 64_230),
+    "source lines": Budget(lambda: lines(files(*PACKAGES, suffixes=SOURCES)), 67_590, 64_230),
     "test lines": Budget(lambda: lines(files("tests")), 36_902, 34_500),
     "words of docs": Budget(
         lambda: words([p for p in files("docs", suffixes=(".md",)) if p.parent.name == "docs"]),
